@@ -1,0 +1,75 @@
+# The front door. `make` lists what there is; .venv is made on first use.
+
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.installed
+
+TERRAIN ?= gap
+EXP ?=
+ARGS ?=
+
+.PHONY: help setup train eval play bench test test-fast check format clean
+
+help:
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+
+setup: $(READY)  ## make .venv and install everything, with CUDA where a GPU answers
+
+train: $(READY)  ## train a policy: TERRAIN=gap EXP=full ARGS="--num-envs 4096"
+	$(BIN)/python -m cref_jax.train --terrain $(TERRAIN) $(if $(EXP),--experiment $(EXP)) $(ARGS)
+
+eval: $(READY)  ## measure success rates: ARGS="--run runs/NAME --suite table"
+	$(BIN)/python -m cref_jax.eval $(ARGS)
+
+play: $(READY)  ## watch a policy: ARGS="--run runs/NAME"
+	$(BIN)/python -m cref_jax.play $(ARGS)
+
+bench: $(READY)  ## measure steps a second on this machine
+	$(BIN)/python -m cref_jax.bench $(ARGS)
+
+test: $(READY)  ## run every test: ARGS="-k depth"
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 $(ARGS)
+
+test-fast: $(READY)  ## run the tests that take seconds
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m "not slow" $(ARGS)
+
+check: $(READY)  ## format, lint and types, without changing a file
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+format: $(READY)  ## format and mend what the linter can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:  ## remove .venv and caches; runs/ stays
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The first Python from 3.11 to 3.14; PYTHON=/path/to/python overrides the search.
+# CUDA 13 needs driver 580 or newer.
+$(READY): pyproject.toml $(wildcard constraints-*.txt)
+	@set -eu; python=""; \
+	for candidate in $(or $(PYTHON),python3.12 python3.13 python3.11 python3); do \
+	  if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' \
+	    2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then \
+	  echo "error: no $(or $(PYTHON),Python) of 3.11 to 3.14 with venv; say PYTHON=/path/to/python" >&2; \
+	  exit 2; \
+	fi; \
+	[ -x $(BIN)/python ] || $$python -m venv $(VENV); \
+	extras=dev,play; \
+	driver=$$(nvidia-smi --query-gpu=driver_version --format=csv,noheader 2>/dev/null | head -1 | cut -d. -f1) \
+	  || driver=""; \
+	if [[ "$$driver" =~ ^[0-9]+$$ ]]; then \
+	  if (( driver >= 580 )); then extras=$$extras,cuda13; else extras=$$extras,cuda12; fi; \
+	fi; \
+	tested=constraints-py$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])').txt; \
+	echo "installing cref-jax[$$extras] into $(VENV) (a few minutes the first time)"; \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$$extras]" \
+	  $$([ -f "$$tested" ] && echo "--constraint $$tested"); \
+	touch $@

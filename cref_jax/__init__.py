@@ -1,0 +1,1 @@
+"""Depth-conditioned humanoid locomotion (CReF) as one jitted JAX program."""

@@ -1,0 +1,218 @@
+"""Measure this machine: `python -m cref_jax.bench`.
+
+Every figure of a table comes from one run, so that they can be compared with each other. Each is
+the best of several repetitions, which disturbs less than a mean by what else the machine does.
+"""
+
+import dataclasses
+import functools
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from cref_jax import cli, config, env, learn, ppo, rollout, runs
+from cref_jax.physics import EngineName, resolve_engine
+from cref_jax.world import World
+
+STEPS = 12  # control steps of one timed call
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure steps a second by stage, and how the engines compare."""
+
+    terrain: str = "mixed"
+    """what the robots stand on"""
+    num_envs: int = 512
+    """robots at once"""
+    repeats: int = 5
+    """the best of so many is taken"""
+    engines: tuple[EngineName, ...] = ("mujoco", "mjx")
+    """engines to compare"""
+    out: Path | None = None
+    """write the figures as JSON, too"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class Row(NamedTuple):
+    """One measured stage."""
+
+    stage: str
+    seconds: float  # for one control step of all robots
+    compile_seconds: float
+
+
+def main() -> None:
+    """Run the command line."""
+    options = tyro.cli(Options, prog="python -m cref_jax.bench")
+    with cli.one_line_errors(options.debug):
+        rows = measure(options)
+        show(options, rows)
+        if options.out:
+            options.out.write_text(json.dumps(as_json(options, rows), indent=2) + "\n")
+
+
+def measure(options: Options) -> list[Row]:
+    """Return every stage's time."""
+    c = config.override(
+        config.Config(),
+        {
+            "terrain": {"name": options.terrain},
+            "run": {"num_envs": options.num_envs},
+            "ppo": {"epochs": 1},
+        },
+    )
+    config.check(c)
+    rows, console = [], Console()
+    for engine in options.engines:
+        with console.status(f"engine {engine}: compiling and timing"):
+            world = runs.world_of(c, engine)
+            robots = jax.jit(rollout.start, static_argnames="num_envs")(
+                world, jax.random.key(0), options.num_envs
+            )
+            rows.append(_timed(f"environment step, {engine}", _steps, options, world, robots))
+            rows.append(_timed(f"physics, {engine}", _physics, options, world, robots))
+    main_engine = resolve_engine("auto")
+    with console.status("learner: compiling and timing"):
+        world = runs.world_of(c, main_engine)
+        state = jax.jit(learn.initial_state)(world)
+        rows.append(_timed("terrain query", _queries, options, world, state.robots))
+        rows.append(_timed("policy", _policy, options, world, state))
+        rows.append(_timed("update, one epoch", _update, options, world, state))
+    return rows
+
+
+def show(options: Options, rows: list[Row]) -> None:
+    """Print the table and the ratios that the design promises."""
+    table = Table(title=f"{options.num_envs} robots, {options.terrain}, {_machine()}")
+    for column in ("stage", "ms a control step", "robot steps/s", "compiled in s"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    for row in rows:
+        rate = options.num_envs / row.seconds
+        table.add_row(
+            row.stage, f"{1e3 * row.seconds:.2f}", f"{rate:,.0f}", f"{row.compile_seconds:.1f}"
+        )
+    console = Console()
+    console.print(table)
+    for name, ratio in ratios(rows).items():
+        console.print(f"{name}: {ratio:.2f}")
+
+
+def ratios(rows: list[Row]) -> dict[str, float]:
+    """Return the comparisons, as far as their stages were measured."""
+    seconds = {row.stage: row.seconds for row in rows}
+    c_step, mjx_step = (seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx"))
+    found = {}
+    if c_step and mjx_step:
+        found["engine mujoco over engine mjx, environment steps/s"] = mjx_step / c_step
+    fastest = min((s for s in (c_step, mjx_step) if s), default=None)
+    if fastest:
+        found["terrain query, share of an environment step"] = seconds["terrain query"] / fastest
+    return found
+
+
+def as_json(options: Options, rows: list[Row]) -> dict[str, Any]:
+    """Return all figures with where they were measured."""
+    return {
+        "machine": _machine(),
+        "num_envs": options.num_envs,
+        "terrain": options.terrain,
+        "rows": [row._asdict() for row in rows],
+        "ratios": ratios(rows),
+    }
+
+
+def _machine() -> str:
+    device = jax.devices()[0]
+    return f"{device.device_kind} x {jax.device_count()}, {os.cpu_count()} CPU cores"
+
+
+def _timed(stage: str, make: Callable[..., Any], options: Options, *arguments: Any) -> Row:
+    """Compile a stage and return its best time for one control step."""
+    begun = time.perf_counter()
+    program = jax.jit(make).lower(*arguments).compile()
+    compiled = time.perf_counter() - begun
+    times = []
+    for _ in range(options.repeats + 1):  # the first call warms up
+        begun = time.perf_counter()
+        jax.block_until_ready(program(*arguments))
+        times.append(time.perf_counter() - begun)
+    return Row(stage, min(times[1:]) / STEPS, compiled)
+
+
+def _steps(world: World, robots: rollout.Robots) -> Any:
+    """Step the whole environment under small random actions."""
+    joints = robots.env.action.shape[-1]
+
+    def step(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, Any]:
+        action = 0.3 * jax.random.normal(key, (*state.step.shape, joints))
+        state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, state, action)
+        return state, (outcome.reward.sum(), outcome.observation.privileged.sum())
+
+    return jax.lax.scan(step, robots.env, jax.random.split(jax.random.key(1), STEPS))
+
+
+def _physics(world: World, robots: rollout.Robots) -> Any:
+    """Step the physics alone, with its terrain queries."""
+    target = jnp.asarray(world.physics.robot.nominal_pose)
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        ground = world.lanes.tile(state.level, state.kind)
+        return world.physics.step(
+            ground, body, jnp.stack([target, target]), state.delay, state.dynamics
+        )[0]
+
+    step = lambda body, _: (jax.vmap(one)(robots.env, body), None)
+    return jax.lax.scan(step, robots.env.body, None, length=STEPS)[0]
+
+
+def _queries(world: World, robots: rollout.Robots) -> Any:
+    """Ask for the tangent planes of all spheres, as often as a control step does."""
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        return world.physics.planes(world.lanes.tile(state.level, state.kind), body)
+
+    def query(body: Any, _: None) -> tuple[Any, None]:
+        position, rotation = jax.vmap(one)(robots.env, body)
+        moved = 1e-6 * (position.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+
+    count = STEPS * world.config.physics.substeps
+    return jax.lax.scan(query, robots.env.body, None, length=count)[0]
+
+
+def _policy(world: World, state: learn.RunState) -> Any:
+    """Run the policy alone."""
+    nets = rollout.networks(world.config.network, state.robots.env.action.shape[-1])
+
+    def step(robots: rollout.Robots, _: None) -> tuple[rollout.Robots, Any]:
+        memory, policy = rollout.act(nets, state.train, robots)
+        return robots.replace(memory=memory), policy.mean.sum()
+
+    return jax.lax.scan(step, state.robots, None, length=STEPS)
+
+
+def _update(world: World, state: learn.RunState) -> Any:
+    """Run one epoch of the update on a rollout of zeros with the right shapes."""
+    c = world.config
+    c = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, horizon=STEPS))
+    nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
+    collect = functools.partial(rollout.collect, dataclasses.replace(world, config=c), nets)
+    shapes = jax.eval_shape(collect, state.train, state.robots, jax.random.key(0))[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets)
+
+
+if __name__ == "__main__":
+    main()

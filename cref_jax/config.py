@@ -1,0 +1,341 @@
+"""Every number of the program, with its unit and its source.
+
+A comment that names a table, a section or an equation points into the CReF paper; `assumed:` marks
+what the paper does not say, so that `grep -rn "assumed:" cref_jax` is the complete list of choices.
+Defaults are the paper's. A run changes them by a TOML file of differences or on the command line.
+"""
+
+import dataclasses
+import difflib
+import tomllib
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+C = TypeVar("C")
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used; the message is one line that says what would be right."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """The AGIBOT X2 Ultra as the policy drives it (Sec. III-A)."""
+
+    actuated: Literal["legs", "legs+waist", "all"] = "legs"
+    # assumed: Table I regularises leg joints only, so the upper body is held
+    action_scale: float = 0.25  # of effort / kp, rad; assumed: the usual scale for these gains
+    action_clip: float = 10.0  # actions; assumed: far outside what is ever useful
+
+
+@dataclass(frozen=True)
+class Physics:
+    """The simulation step, the same in both engines."""
+
+    timestep: float = 0.005  # s; assumed: four substeps a control step are stable
+    substeps: int = 4  # 4 x 5 ms = 20 ms = 50 Hz, Sec. II-D
+    iterations: int = 6  # Newton; assumed: with 4, MJX and MuJoCo C part by up to 0.03 rad/s a step
+    line_search: int = 10  # assumed: as for the iterations
+    velocity_limit: float = 100.0  # m/s or rad/s; assumed: beyond it a state has blown up
+
+    @property
+    def control_period(self) -> float:
+        """Length of a control step, s."""
+        return self.timestep * self.substeps
+
+
+@dataclass(frozen=True)
+class RewardWeights:
+    """Weights w_i of Table I. A field here is a function of the same name in reward.py."""
+
+    linear_velocity_tracking: float = 2.5
+    angular_velocity_tracking: float = 1.5
+    orientation: float = 1.0
+    feet_contact: float = 1.5
+    feet_y_distance: float = 0.1
+    base_height: float = 0.8
+    linear_velocity_z: float = -1.0
+    angular_velocity_xy: float = -0.05
+    joint_velocity: float = -1e-3
+    action_rate: float = -0.01
+    action_smoothness: float = -0.01
+    feet_air_time: float = -2.5
+    foot_slip: float = -0.2
+    foot_impact_acceleration: float = -0.5
+    foot_impact_velocity: float = -1.5
+    joint_position_limits: float = -10.0
+    joint_velocity_limits: float = -0.6
+    hip_position: float = -7.0
+    ankle_position: float = -10.0
+    stumble: float = -10.0
+
+
+@dataclass(frozen=True)
+class Reward:
+    """Constants inside the reward expressions of Table I."""
+
+    weights: RewardWeights = field(default_factory=RewardWeights)
+    times_dt: bool = True  # assumed: legged_gym's convention
+    clip_at_zero: bool = True  # assumed: without it the negative sum at first teaches falling
+    sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym
+    sigma_omega: float = 0.25  # rad^2/s^2; assumed: legged_gym
+    low_speed: float = 0.2  # m/s, v_s; assumed: between 0.1 and 0.2 in published code
+    standing: float = 0.1  # u_s; assumed: between 0.05 and 0.1 in published code
+    single_contact_window: float = 0.2  # s, Table I
+    feet_y_target: float = 0.27  # m, Table I
+    base_height_target: float = 0.55  # m above the ankle-roll frames, Table I
+    support_force: float = 1.0  # N, Eq. 5
+    contact_force: float = 5.0  # N, Table I (foot slip)
+    air_time_target: float = 0.5  # s, Table I
+    impact_acceleration: float = 50.0  # m/s^2, a_0; assumed: no source states one
+    impact_velocity: float = 0.6  # m/s, v_0; assumed: no source states one
+    stumble_ratio: float = 5.0  # Table I
+    soft_limit: float = 0.95  # of the joint range; assumed: as in legged_gym, 0.9 to 0.95
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the robot is asked to do. Ranges are uniform."""
+
+    vx: tuple[float, float] = (0.0, 1.0)  # m/s; assumed: covers the 0.4-0.8 of Sec. III-A
+    vy: tuple[float, float] = (-0.3, 0.3)  # m/s; assumed
+    yaw_rate: tuple[float, float] = (-1.0, 1.0)  # rad/s; assumed
+    standing: float = 0.1  # share of standing commands; assumed
+    period: tuple[float, float] = (8.0, 12.0)  # s between two draws; assumed
+    open_kinds: tuple[str, ...] = ("flat",)  # walked in all directions; the rest along a lane
+    lane_vx: tuple[float, float] = (0.4, 0.8)  # m/s on terrain, Sec. III-A
+    heading_gain: float = 1.0  # 1/s, yaw rate per radian off the lane's direction; assumed
+    lane_gain: float = 0.5  # rad/m, heading per metre off the lane's middle; assumed
+    lane_yaw_rate: float = 0.6  # rad/s, limit of the heading control; assumed
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Domain randomisation, drawn anew at each reset. assumed: the paper names none."""
+
+    enabled: bool = True
+    friction: tuple[float, float] = (0.3, 1.2)  # sliding friction coefficient
+    trunk_mass: float = 2.5  # kg, +-
+    trunk_com: float = 0.05  # m, +-, each axis
+    gains: tuple[float, float] = (0.8, 1.2)  # factor on kp and, apart, on kd
+    joint_offset: float = 0.035  # rad, +-, encoder zero
+    action_delay: float = 0.020  # s, up to
+    push_velocity: float = 1.0  # m/s, up to, planar
+    push_period: tuple[float, float] = (5.0, 10.0)  # s between two pushes
+    noise_angular_velocity: float = 0.2  # rad/s, +-
+    noise_gravity: float = 0.05  # +-
+    noise_joint_position: float = 0.01  # rad, +-
+    noise_joint_velocity: float = 1.5  # rad/s, +-
+
+
+@dataclass(frozen=True)
+class Episode:
+    """How an episode starts and ends."""
+
+    length: float = 20.0  # s; assumed: 20 s in training, 40 s in evaluation
+    max_tilt: float = 1.0  # rad; assumed
+    min_height: float = 0.28  # m, pelvis above the supporting ankles, 0.35 above the sole; assumed
+    below_edge: float = 0.5  # m, a foot below the last support: into a gap; assumed: two 23 cm
+    # treads at once are still a step, and gap floors lie 1 m down
+    start_x: tuple[float, float] = (0.5, 1.0)  # m along the lane; assumed
+    start_y: tuple[float, float] = (-0.3, 0.3)  # m across the lane; assumed
+    lane_end: float = 1.0  # m before the lane's end where an episode is won; assumed
+    yaw_jitter: float = 0.2  # rad, +-, at reset on a lane; assumed
+    bank_size: int = 64  # settled states to start from; assumed
+    settle_time: float = 0.4  # s under PD before a state enters the bank; assumed: the feet have
+    # settled, and PD alone, which holds the pose for 1.5 s, has not begun to fall
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """The lanes that robots are trained on. Sizes of obstacles stand in terrains/*.toml."""
+
+    name: str = "flat"  # a file in terrains/, or a path to .toml, .npy or .png
+    cell: float = 0.02  # m; assumed: divides treads, windows and strides
+    lane_length: float = 12.0  # m; assumed
+    lane_width: float = 4.0  # m; assumed
+    levels: int = 10  # assumed: as legged_gym
+    seed: int = 1  # of the random heights and landings
+
+
+@dataclass(frozen=True)
+class Curriculum:
+    """Which level of its terrain a robot meets next. assumed: legged_gym's rule."""
+
+    enabled: bool = True
+    up: float = 0.5  # of the lane walked: one level harder
+    down: float = 0.5  # less than this share of the commanded distance: one level easier
+    start_level: int = 2  # highest level at the start
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The critic's height samples m_t, in the robot's yaw frame (Eq. 3)."""
+
+    x: tuple[float, float, int] = (-0.5, 1.1, 17)  # m from, m to, samples; assumed
+    y: tuple[float, float, int] = (-0.4, 0.4, 9)  # m from, m to, samples; assumed
+    base_height: float = 0.62  # m, nominal, taken off; the base above the soles at q_0
+    clip: float = 1.0  # m; assumed
+
+
+@dataclass(frozen=True)
+class Network:
+    """Widths of the actor (Sec. II-B) and of the critic. assumed: the paper gives none."""
+
+    variant: Literal["blind"] = "blind"
+    token: int = 128  # d
+    lstm: int = 256  # velocity estimator
+    gru: int = 256  # recurrent fusion
+    actor: tuple[int, ...] = (512, 256, 128)  # action head
+    critic: tuple[int, ...] = (512, 256, 128)
+    initial_std: float = 0.8  # of the action distribution
+
+
+@dataclass(frozen=True)
+class PPO:
+    """Proximal policy optimisation. assumed: mjlab's numbers for a humanoid of this size."""
+
+    horizon: int = 24  # control steps an iteration
+    epochs: int = 5
+    minibatches: int = 4
+    clip: float = 0.2
+    value_clip: float = 0.2
+    value_weight: float = 1.0
+    entropy_weight: float = 0.005
+    estimator_weight: float = 1.0  # of the velocity estimator's L2 loss
+    gamma: float = 0.99
+    lam: float = 0.95
+    learning_rate: float = 1e-3
+    learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    target_kl: float = 0.01
+    max_gradient_norm: float = 1.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """How large a run is, and how often it is written down."""
+
+    num_envs: int = 4096  # robots at once, Sec. II-D
+    iterations: int = 20_000  # Sec. II-D
+    seed: int = 0
+    chunk: int = 10  # iterations in one call of the compiled program; changes no result
+    checkpoint_minutes: float = 5.0  # between two checkpoints
+    keep: int = 3  # checkpoints that stay on disk
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run, whole."""
+
+    run: Run = field(default_factory=Run)
+    robot: Robot = field(default_factory=Robot)
+    physics: Physics = field(default_factory=Physics)
+    terrain: Terrain = field(default_factory=Terrain)
+    curriculum: Curriculum = field(default_factory=Curriculum)
+    command: Command = field(default_factory=Command)
+    episode: Episode = field(default_factory=Episode)
+    randomisation: Randomisation = field(default_factory=Randomisation)
+    reward: Reward = field(default_factory=Reward)
+    scan: Scan = field(default_factory=Scan)
+    network: Network = field(default_factory=Network)
+    ppo: PPO = field(default_factory=PPO)
+
+
+def override(config: C, changes: dict[str, Any], where: str = "") -> C:
+    """Return `config` with the nested `changes` applied.
+
+    Raises:
+        ConfigError: a key that does not exist (the nearest one is named), or a bad value.
+    """
+    hints = typing.get_type_hints(type(config))
+    values: dict[str, Any] = {}
+    for key, value in changes.items():
+        path = f"{where}{key}"
+        if key not in hints:
+            raise ConfigError(unknown("setting", path, [where + hint for hint in hints]))
+        if dataclasses.is_dataclass(hints[key]):
+            if not isinstance(value, dict):
+                raise ConfigError(f"'{path}' is a table of settings, not {value!r}")
+            values[key] = override(getattr(config, key), value, where=f"{path}.")
+        else:
+            values[key] = _checked(value, hints[key], path)
+    return dataclasses.replace(config, **values)  # type: ignore[type-var]
+
+
+def unknown(what: str, name: str, known: list[str]) -> str:
+    """Return the message for a name that does not exist: the nearest one, or all that do."""
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
+    return f"unknown {what} '{name}'; {hint}"
+
+
+def check(c: Config) -> None:
+    """Refuse settings that could not run, before anything is compiled.
+
+    Raises:
+        ConfigError: says which setting, and what would be right.
+    """
+    positive = {
+        "run.num_envs": c.run.num_envs,
+        "run.iterations": c.run.iterations,
+        "run.chunk": c.run.chunk,
+        "ppo.horizon": c.ppo.horizon,
+        "ppo.epochs": c.ppo.epochs,
+        "ppo.minibatches": c.ppo.minibatches,
+        "physics.substeps": c.physics.substeps,
+        "terrain.levels": c.terrain.levels,
+        "episode.bank_size": c.episode.bank_size,
+    }
+    for name, value in positive.items():
+        if value < 1:
+            raise ConfigError(f"'{name}' must be at least 1, not {value}")
+    robots, parts = c.run.num_envs, c.ppo.minibatches
+    if robots % parts:
+        below, above = robots // parts * parts, -(-robots // parts) * parts
+        near = f"{below} or {above}" if below else f"{above}"
+        raise ConfigError(f"{robots} robots do not split into {parts} minibatches; take {near}")
+    if not 1e-4 <= c.physics.timestep <= 0.02:
+        raise ConfigError(f"'physics.timestep' must be 0.0001 to 0.02 s, not {c.physics.timestep}")
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises:
+        ConfigError: the file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"no file {path}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _checked(value: Any, hint: Any, path: str) -> Any:
+    """Return `value` as the type that the field declares, or say what would be right."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        inner = next(arg for arg in args if arg is not type(None))
+        return None if value is None else _checked(value, inner, path)
+    if origin is Literal:
+        if value not in args:
+            raise ConfigError(
+                f"'{path}' must be one of {', '.join(map(repr, args))}, not {value!r}"
+            )
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"'{path}' must be a list, not {value!r}")
+        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
+        if len(kinds) != len(value):
+            raise ConfigError(f"'{path}' takes {len(kinds)} values, not {len(value)}")
+        return tuple(_checked(v, k, path) for v, k in zip(value, kinds, strict=True))
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not hint:
+        raise ConfigError(f"'{path}' must be {hint.__name__}, not {value!r}")
+    return value

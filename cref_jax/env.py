@@ -1,0 +1,185 @@
+"""One robot's observation and step: the wiring of physics, reward and episode.
+
+Everything here is for one robot; `jax.vmap` over the state and the key makes thousands, with the
+world shared by all.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cref_jax import config, episode, geometry, observation, reward, terrain
+from cref_jax.episode import Ending, EnvState
+from cref_jax.kinematics import Links
+from cref_jax.observation import Observation
+from cref_jax.physics import Body
+from cref_jax.world import World
+
+
+class Measures(NamedTuple):
+    """What the log and the evaluation look at, of the step that was made."""
+
+    terms: dict[str, Float[Array, ""]]  # weighted reward terms, per second
+    speed_error: Float[Array, ""]  # m/s, of the planar velocity
+    forward_speed: Float[Array, ""]  # m/s, body frame
+    forward_command: Float[Array, ""]  # m/s
+    airborne: Bool[Array, " F"]  # the foot is off the ground
+    progress: Float[Array, ""]  # m from the start along the lane
+    commanded: Float[Array, ""]  # m asked for
+    steps: Int[Array, ""]  # control steps in the episode, this one included
+    kind: Int[Array, ""]
+    level: Int[Array, ""]
+
+
+class Outcome(NamedTuple):
+    """What a step gives to the learner."""
+
+    observation: Observation  # of the following state, which is a fresh one after an end
+    last_privileged: Float[Array, " S"]  # s of the state reached, before any reset
+    reward: Float[Array, ""]
+    ending: Ending
+    measures: Measures
+
+
+def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
+    """Return what the robot and the critic see in this state."""
+    c, robot = world.config, world.physics.robot
+    clean = observation.motion(state.body.qpos, state.body.qvel)
+    sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
+    if c.randomisation.enabled:
+        sensed = observation.with_noise(sensed, c.randomisation, key)
+    see = lambda m: observation.proprioception(
+        m, state.command, jnp.asarray(robot.nominal_pose), state.action
+    )
+    scan = observation.height_scan(_ground(world, state), state.body.qpos, c.scan)
+    return Observation(
+        proprioception=see(sensed),
+        privileged=observation.privileged(see(clean), clean.velocity, scan),
+        velocity=clean.velocity,
+    )
+
+
+def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[EnvState, Outcome]:
+    """Advance 20 ms: command, push, physics, reward, end of episode, next observation."""
+    c = world.config
+    key, key_push, key_command, key_reset, key_see = jax.random.split(state.key, 5)
+    state = episode.commanded(
+        world, episode.pushed(world, state.replace(key=key), key_push), key_command
+    )
+    action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
+
+    targets = jnp.stack([_target(world, state, state.action), _target(world, state, action)])
+    body, force = world.physics.step(
+        _ground(world, state), state.body, targets, state.delay, state.dynamics
+    )
+    unstable = _blown_up(body, c.physics)
+    body = jax.tree.map(lambda new, old: jnp.where(unstable, old, new), body, state.body)
+    force = jnp.where(unstable, 0.0, force)
+
+    links = world.physics.links(body)
+    snapshot = _snapshot(world, state, body, links, force, action)
+    lived = _lived(state, body, snapshot, c.reward)
+    gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
+    ending = episode.ending(world, lived, links, unstable)
+    measures = _measures(lived, snapshot, terms)
+    last = observe(world, lived, key_see)
+
+    done = ending.terminated | ending.truncated
+    level = episode.next_level(world, lived, ending, key_reset)
+    fresh = episode.reset(world, key_reset, lived.kind, level)
+    following = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, lived)
+    first = observe(world, fresh, key_see)
+    seen = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, last)
+    gained = jnp.where(unstable, 0.0, gained)
+    return following, Outcome(seen, last.privileged, gained, ending, measures)
+
+
+def _ground(world: World, state: EnvState) -> terrain.Terrain:
+    return world.lanes.tile(state.level, state.kind)
+
+
+def _target(world: World, state: EnvState, action: Float[Array, " J"]) -> Float[Array, " J"]:
+    """q_target = q_0 + a, Eq. 4, per-joint scale; the encoder's offset shifts what is reached."""
+    robot = world.physics.robot
+    return robot.nominal_pose + robot.action_scale * action - state.joint_offset
+
+
+def _blown_up(body: Body, c: config.Physics) -> Bool[Array, ""]:
+    finite = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
+    return ~(finite & (jnp.abs(body.qvel).max() < c.velocity_limit))
+
+
+def _snapshot(
+    world: World,
+    state: EnvState,
+    body: Body,
+    links: Links,
+    force: Float[Array, "F 3"],
+    action: Float[Array, " J"],
+) -> reward.Snapshot:
+    """Return what the reward may look at, from the state before the step and the body after it."""
+    c, feet = world.config, world.physics.feet
+    period = c.physics.control_period
+    foot = links.position[feet]
+    touching = reward.is_touching(force, c.reward)
+    single = touching[0] ^ touching[1]
+    now = observation.motion(body.qpos, body.qvel)
+    across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
+    return reward.Snapshot(
+        velocity=now.velocity,
+        angular_velocity=now.angular_velocity,
+        gravity=now.gravity,
+        command=state.command,
+        base_z=body.qpos[2],
+        joint_position=now.joint_position,
+        joint_velocity=now.joint_velocity,
+        action=action,
+        action_1=state.action,
+        action_2=state.action_before,
+        foot_z=foot[:, 2],
+        feet_y=jnp.abs(across),
+        foot_velocity=links.velocity[feet],
+        foot_velocity_before=state.foot_velocity,
+        foot_force=force,
+        first_contact=touching & (state.air_time > 0.0),
+        air_time=state.air_time + period,
+        since_single=jnp.where(single, 0.0, state.since_single + period),
+        control_period=jnp.float32(period),
+    )
+
+
+def _lived(state: EnvState, body: Body, s: reward.Snapshot, c: config.Reward) -> EnvState:
+    """Return the state after the step, if the episode goes on."""
+    touching = reward.is_touching(s.foot_force, c)
+    support = reward.support_height(s.foot_z, s.foot_force, c)
+    return state.replace(
+        body=body,
+        action=s.action,
+        action_before=s.action_1,
+        foot_velocity=s.foot_velocity,
+        air_time=jnp.where(touching, 0.0, s.air_time),
+        since_single=s.since_single,
+        support_z=jnp.where(touching.any(), support, state.support_z),
+        step=state.step + 1,
+    )
+
+
+def _measures(
+    state: EnvState,
+    s: reward.Snapshot,
+    terms: dict[str, Float[Array, ""]],
+) -> Measures:
+    return Measures(
+        terms=terms,
+        speed_error=jnp.linalg.norm(s.command[:2] - s.velocity[:2]),
+        forward_speed=s.velocity[0],
+        forward_command=s.command[0],
+        airborne=state.air_time > 0.0,
+        progress=state.body.qpos[0] - state.start[0],
+        commanded=state.commanded,
+        steps=state.step,
+        kind=state.kind,
+        level=state.level,
+    )

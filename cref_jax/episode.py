@@ -1,0 +1,230 @@
+"""How an episode of one robot begins, what disturbs it, how it ends and what follows.
+
+Coordinates are the lane's own: x along it from its start, y across, z = 0 at the start.
+"""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cref_jax import config, geometry
+from cref_jax.host_physics import Dynamics
+from cref_jax.kinematics import Links
+from cref_jax.physics import Body
+from cref_jax.world import World
+
+
+@flax.struct.dataclass
+class EnvState:
+    """One robot between two control steps."""
+
+    key: PRNGKeyArray
+    body: Body
+    dynamics: Dynamics
+    joint_offset: Float[Array, " J"]  # rad, encoder zero
+    delay: Int[Array, ""]  # substeps until a new target arrives
+    kind: Int[Array, ""]  # of terrain
+    level: Int[Array, ""]  # of difficulty
+    start: Float[Array, "2"]  # m, where the episode began
+    command: Float[Array, "3"]  # m/s, m/s, rad/s
+    command_left: Int[Array, ""]  # control steps until the next draw
+    push_left: Int[Array, ""]  # control steps until the next push
+    commanded: Float[Array, ""]  # m, distance asked for so far
+    action: Float[Array, " J"]  # a_{t-1}
+    action_before: Float[Array, " J"]  # a_{t-2}
+    foot_velocity: Float[Array, "F 3"]  # m/s, world
+    air_time: Float[Array, " F"]  # s since each foot touched
+    since_single: Float[Array, ""]  # s since one foot alone touched
+    support_z: Float[Array, ""]  # m, height of the last support
+    step: Int[Array, ""]  # control steps into the episode
+
+
+class Ending(NamedTuple):
+    """Why an episode is over; the first five are failures."""
+
+    tilted: Bool[Array, ""]
+    low: Bool[Array, ""]  # the pelvis is too near to the support
+    hit: Bool[Array, ""]  # torso, head, pelvis or thigh is in the terrain
+    dropped: Bool[Array, ""]  # a foot is far below the last support
+    unstable: Bool[Array, ""]  # the physics has blown up
+    finished: Bool[Array, ""]  # at the lane's end
+    timeout: Bool[Array, ""]
+
+    @property
+    def terminated(self) -> Bool[Array, ""]:
+        """The robot has failed: no value follows."""
+        return self.tilted | self.low | self.hit | self.dropped | self.unstable
+
+    @property
+    def truncated(self) -> Bool[Array, ""]:
+        """The episode was cut although the robot could have gone on."""
+        return (self.finished | self.timeout) & ~self.terminated
+
+
+def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Array, ""]) -> EnvState:
+    """Return a robot at the start of a lane of that kind and level."""
+    c = world.config
+    keys = jax.random.split(key, 8)
+    joints = len(world.physics.robot.joint_names)
+    body = _placed(world, keys[0])
+    dynamics, offset, delay = _drawn_dynamics(world, keys[1])
+    return EnvState(
+        key=keys[2],
+        body=body,
+        dynamics=dynamics,
+        joint_offset=offset,
+        delay=delay,
+        kind=kind,
+        level=level,
+        start=body.qpos[:2],
+        command=_drawn_command(world, keys[3], kind),
+        command_left=_drawn_steps(c, keys[4], c.command.period),
+        push_left=_drawn_steps(c, keys[5], c.randomisation.push_period),
+        commanded=jnp.zeros(()),
+        action=jnp.zeros(joints),
+        action_before=jnp.zeros(joints),
+        foot_velocity=jnp.zeros((2, 3)),
+        air_time=jnp.zeros(2),
+        since_single=jnp.zeros(()),
+        support_z=body.qpos[2] - c.reward.base_height_target,
+        step=jnp.zeros((), jnp.int32),
+    )
+
+
+def pushed(world: World, state: EnvState, key: PRNGKeyArray) -> EnvState:
+    """Add a sudden planar velocity to the base when a push is due."""
+    c = world.config.randomisation
+    if not c.enabled:
+        return state
+    key_push, key_next = jax.random.split(key)
+    due = state.push_left <= 0
+    shove = jax.random.uniform(key_push, (2,), minval=-c.push_velocity, maxval=c.push_velocity)
+    qvel = state.body.qvel.at[:2].add(jnp.where(due, shove, 0.0))
+    again = _drawn_steps(world.config, key_next, c.push_period)
+    return state.replace(
+        body=state.body._replace(qvel=qvel),
+        push_left=jnp.where(due, again, state.push_left - 1),
+    )
+
+
+def commanded(world: World, state: EnvState, key: PRNGKeyArray) -> EnvState:
+    """Draw a new command when one is due; on a lane, steer back to its middle and direction."""
+    c = world.config
+    key_command, key_next = jax.random.split(key)
+    due = state.command_left <= 0
+    command = jnp.where(due, _drawn_command(world, key_command, state.kind), state.command)
+    again = _drawn_steps(c, key_next, c.command.period)
+
+    heading = geometry.yaw(state.body.qpos[3:7])
+    wanted = jnp.clip(-c.command.lane_gain * state.body.qpos[1], -0.5, 0.5)  # rad
+    error = jnp.mod(wanted - heading + jnp.pi, 2 * jnp.pi) - jnp.pi
+    limit = c.command.lane_yaw_rate
+    steer = jnp.clip(c.command.heading_gain * error, -limit, limit)
+    is_open = jnp.asarray(np.isin(world.lanes.kinds, c.command.open_kinds))[state.kind]
+    command = command.at[2].set(jnp.where(is_open, command[2], steer))
+    return state.replace(
+        command=command,
+        command_left=jnp.where(due, again, state.command_left - 1),
+        commanded=state.commanded + jnp.linalg.norm(command[:2]) * c.physics.control_period,
+    )
+
+
+def ending(world: World, state: EnvState, links: Links, unstable: Bool[Array, ""]) -> Ending:
+    """Judge the state that a step has led to."""
+    c = world.config
+    gravity_z = geometry.rotate_inverse(state.body.qpos[3:7], jnp.array([0.0, 0.0, -1.0]))[2]
+    foot_z = links.position[world.physics.feet, 2]
+    pelvis_z = state.body.qpos[2]
+    has_end = jnp.asarray(~np.isin(world.lanes.kinds, c.command.open_kinds))[state.kind]
+    return Ending(
+        tilted=gravity_z > -jnp.cos(c.episode.max_tilt),
+        low=pelvis_z - state.support_z < c.episode.min_height,
+        hit=world.physics.is_hit(world.lanes.tile(state.level, state.kind), links),
+        dropped=foot_z.min() < state.support_z - c.episode.below_edge,
+        unstable=unstable,
+        finished=has_end & (state.body.qpos[0] > world.lanes.length - c.episode.lane_end),
+        timeout=state.step >= round(c.episode.length / c.physics.control_period),
+    )
+
+
+def next_level(world: World, state: EnvState, over: Ending, key: PRNGKeyArray) -> Int[Array, ""]:
+    """Return the level of the next episode: harder after a good one, easier after a poor one.
+
+    Beyond the hardest level a random one follows.
+    """
+    c = world.config
+    if not c.curriculum.enabled:
+        return state.level
+    walked = state.body.qpos[0] - state.start[0]
+    up = ~over.terminated & (over.finished | (walked > c.curriculum.up * world.lanes.length))
+    down = ~up & (walked < c.curriculum.down * state.commanded)
+    level = jnp.maximum(state.level + up.astype(jnp.int32) - down.astype(jnp.int32), 0)
+    anew = jax.random.randint(key, (), 0, world.lanes.levels)
+    return jnp.where(level >= world.lanes.levels, anew, level)
+
+
+def _placed(world: World, key: PRNGKeyArray) -> Body:
+    """Return a settled state from the bank, somewhere on the lane's start, turned a little."""
+    c = world.config.episode
+    key_pick, key_x, key_y, key_yaw = jax.random.split(key, 4)
+    pick = jax.random.randint(key_pick, (), 0, c.bank_size)
+    body = jax.tree.map(lambda x: x[pick], world.bank)
+    uniform = lambda k, low, high: jax.random.uniform(k, (), minval=low, maxval=high)
+    turn = uniform(key_yaw, -c.yaw_jitter, c.yaw_jitter)
+    about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
+    place = jnp.stack([uniform(key_x, *c.start_x), uniform(key_y, *c.start_y)])
+    return Body(
+        qpos=body.qpos.at[:2]
+        .set(place)
+        .at[3:7]
+        .set(geometry.quat_multiply(about_z, body.qpos[3:7])),
+        qvel=body.qvel.at[:3].set(geometry.rotate_yaw(turn, body.qvel[:3])),
+        warmstart=body.warmstart,
+    )
+
+
+def _drawn_dynamics(
+    world: World, key: PRNGKeyArray
+) -> tuple[Dynamics, Float[Array, " J"], Int[Array, ""]]:
+    """Draw the robot's dynamics, its encoder offsets and its action delay in substeps."""
+    c, nominal = world.config.randomisation, world.physics.nominal_dynamics()
+    if not c.enabled:
+        return nominal, jnp.zeros_like(nominal.kp), jnp.zeros((), jnp.int32)
+    keys = jax.random.split(key, 7)
+    draw = lambda k, shape, low, high: jax.random.uniform(k, shape, minval=low, maxval=high)
+    joints = nominal.kp.shape
+    dynamics = Dynamics(
+        friction=draw(keys[0], (), *c.friction),
+        payload=draw(keys[1], (), -c.trunk_mass, c.trunk_mass),
+        com_shift=draw(keys[2], (3,), -c.trunk_com, c.trunk_com),
+        kp=nominal.kp * draw(keys[3], joints, *c.gains),
+        kd=nominal.kd * draw(keys[4], joints, *c.gains),
+    )
+    most = round(c.action_delay / world.config.physics.timestep)
+    return (
+        dynamics,
+        draw(keys[5], joints, -c.joint_offset, c.joint_offset),
+        jax.random.randint(keys[6], (), 0, most + 1),
+    )
+
+
+def _drawn_command(world: World, key: PRNGKeyArray, kind: Int[Array, ""]) -> Float[Array, "3"]:
+    """Draw a velocity command: any direction on open ground, forward along a lane."""
+    c = world.config.command
+    keys = jax.random.split(key, 5)
+    draw = lambda k, span: jax.random.uniform(k, (), minval=span[0], maxval=span[1])
+    free = jnp.stack([draw(keys[0], c.vx), draw(keys[1], c.vy), draw(keys[2], c.yaw_rate)])
+    free = jnp.where(jax.random.uniform(keys[3]) < c.standing, jnp.zeros(3), free)
+    along = jnp.stack([draw(keys[4], c.lane_vx), jnp.zeros(()), jnp.zeros(())])
+    is_open = np.isin(world.lanes.kinds, c.open_kinds)
+    return jnp.where(jnp.asarray(is_open)[kind], free, along)
+
+
+def _drawn_steps(c: config.Config, key: PRNGKeyArray, span: tuple[float, float]) -> Int[Array, ""]:
+    """Draw a time within `span` s, in control steps."""
+    low, high = (round(t / c.physics.control_period) for t in span)
+    return jax.random.randint(key, (), low, high + 1)

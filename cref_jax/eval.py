@@ -1,0 +1,58 @@
+"""Judge a policy: `python -m cref_jax.eval --run runs/NAME`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from cref_jax import cli, evaluation, runs
+from cref_jax.physics import EngineName
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure how a trained policy walks."""
+
+    run: Path | None = None
+    """runs/NAME; the newest one when left out"""
+    suite: Literal["walk"] = "walk"
+    """walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s"""
+    num_envs: int = 100
+    """episodes"""
+    seed: int = 0
+    """of the first states and commands"""
+    engine: EngineName = "auto"
+    """mujoco steps on the CPU, mjx on the device"""
+    out: Path | None = None
+    """folder for eval.json; the run's own when left out"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+def main() -> None:
+    """Run the command line."""
+    options = tyro.cli(Options, prog="python -m cref_jax.eval")
+    with cli.one_line_errors(options.debug):
+        run = options.run or runs.newest()
+        world = runs.world_of(runs.read_config(run), options.engine)
+        policy = runs.load_policy(run, world)
+        result = evaluation.walk(
+            policy.config, world.physics, policy.train, options.num_envs, options.seed
+        )
+        print(f"{run}, iteration {policy.iteration}: {result.line()}")
+        out = options.out or run
+        out.mkdir(parents=True, exist_ok=True)
+        record = {
+            "suite": options.suite,
+            "run": str(run),
+            "iteration": policy.iteration,
+            "seed": options.seed,
+            **result._asdict(),
+        }
+        (out / "eval.json").write_text(json.dumps(record, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

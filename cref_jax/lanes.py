@@ -1,0 +1,291 @@
+"""The lanes that robots walk on: their numbers from TOML, and one grid of them all.
+
+A file in `terrains/` names kinds of lane, says how large their obstacles are at the lowest and at
+the highest level, and gives what else their shapes need. A user's own height map is a lane as well.
+"""
+
+import dataclasses
+import difflib
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import flax.struct
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+from PIL import Image
+
+from cref_jax import config, terrain
+from cref_jax.config import ConfigError
+from cref_jax.shapes import KINDS, START, Range, columns
+from cref_jax.terrain import Terrain
+
+MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: within START
+MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
+
+
+@flax.struct.dataclass
+class Atlas:
+    """All lanes in one grid: rows are levels, columns are kinds."""
+
+    terrain: Terrain  # the whole grid, in the coordinates of its first tile
+    sizes: Float[np.ndarray | Array, "levels kinds"]  # m; m/m for a slope
+    kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
+    columns: tuple[int, int] = flax.struct.field(pytree_node=False)  # of the grid, along, across
+
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return self.sizes.shape[0]
+
+    @property
+    def length(self) -> float:
+        """Length of a lane, m."""
+        return self.columns[0] * self.terrain.cell
+
+    def tile(self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""]) -> Terrain:
+        """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""
+        return terrain.tile(self.terrain, self.columns, level, kind)
+
+
+def build(c: config.Terrain) -> Atlas:
+    """Return the lanes of a terrain, or a user's own height map.
+
+    Raises:
+        ConfigError: no such terrain, or a file that cannot be used.
+    """
+    path = Path(c.name)
+    if path.suffix in (".npy", ".png"):
+        return _own_map(path)
+    _check_lane(c)
+    numbers = _numbers(c.name)
+    sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
+    return _atlas(c, numbers, sizes)
+
+
+def single(c: config.Terrain, kind: str, size: float) -> Atlas:
+    """Return one lane of one kind whose obstacles have exactly this size, m."""
+    _check_lane(c)
+    if not size >= 0.0:
+        raise ConfigError(f"the size of '{kind}' must not be below zero: {size}")
+    return _atlas(c, {kind: _numbers_of(c, kind)}, np.array([[size]]))
+
+
+def named_sizes(c: config.Terrain, kind: str) -> dict[str, float]:
+    """Return the sizes a kind is evaluated at: easy, medium, hard, ood, m; nothing if none are."""
+    levels = _numbers_of(c, kind).levels
+    return dataclasses.asdict(levels) if levels else {}
+
+
+def directory() -> Path:
+    """Return where the terrain files are: in an installed package, or beside it in a checkout."""
+    package = Path(__file__).parent
+    return next(d for d in (package / "terrains", package.parent / "terrains") if d.is_dir())
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """The sizes of one kind in Table II, m."""
+
+    easy: float
+    medium: float
+    hard: float
+    ood: float
+
+
+class _Numbers(NamedTuple):
+    """What a terrain file says about a kind."""
+
+    train: Range  # m, size at the lowest and the highest level
+    levels: _Levels | None  # m, sizes for evaluation
+    shape: Any  # the record that KINDS names
+
+
+@dataclass(frozen=True)
+class _KindsFile:
+    """A terrain file that defines kinds."""
+
+    kinds: tuple[str, ...]
+    train: Range
+    levels: dict
+    shape: dict
+
+
+@dataclass(frozen=True)
+class _MixFile:
+    """A terrain file that takes all kinds of other ones."""
+
+    mix: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _MapFile:
+    """The file beside a user's height map."""
+
+    cell: float  # m, side of a column
+    start: tuple[float, float]  # m, from the map's first corner to where the robot starts
+    scale: float  # m for one step of the map's values
+
+
+def _atlas(c: config.Terrain, numbers: dict[str, _Numbers], sizes: np.ndarray) -> Atlas:
+    """Return the lanes of each kind, a column of tiles, at each of its sizes [levels, kinds]."""
+    along, across = columns(c.lane_length, c), columns(c.lane_width, c)
+    _check_columns((along * sizes.shape[0], across * sizes.shape[1]), f"terrain '{c.name}'")
+    heights = np.empty((sizes.shape[0], along, sizes.shape[1], across), np.float32)
+    for k, (kind, n) in enumerate(numbers.items()):
+        for level, size in enumerate(sizes[:, k]):
+            # of seed, kind and size alone, so that a lane is the same in whatever mix it stands
+            rng = np.random.default_rng([c.seed, zlib.crc32(kind.encode()), round(1e4 * size)])
+            heights[level, :, k] = KINDS[kind].heights(c, float(size), n.shape, rng)
+            if heights[level, : columns(START, c), k].any():
+                raise ConfigError(f"'{kind}' must leave {START} m of level ground at its start")
+    grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
+    origin = (0.0, -0.5 * across * c.cell)
+    return Atlas(terrain.from_heights(grid, c.cell, origin), sizes, tuple(numbers), (along, across))
+
+
+def _check_lane(c: config.Terrain) -> None:
+    """Refuse lanes of no extent."""
+    if not c.cell > 0.0 or min(c.lane_length, c.lane_width, c.levels) <= 0:
+        raise ConfigError("a terrain's cell, lane_length, lane_width and levels must be above zero")
+
+
+def _check_columns(shape: tuple[int, int], what: str) -> None:
+    """Refuse a grid that would not fit into memory."""
+    if shape[0] * shape[1] > MAX_COLUMNS:
+        raise ConfigError(f"{what} has {shape[0]} x {shape[1]} columns, more than {MAX_COLUMNS:g}")
+
+
+def _numbers(name: str) -> dict[str, _Numbers]:
+    """Return what a terrain, named or given by its file, says about each of its kinds."""
+    table, where = _table(name)
+    if "mix" not in table:
+        return _kinds(table, where)
+    numbers: dict[str, _Numbers] = {}
+    for part in _record(_MixFile, table, where).mix:
+        numbers |= _kinds(*_table(part))
+    if not numbers:
+        raise ConfigError(f"{where}: mix must name at least one terrain")
+    return numbers
+
+
+def _table(name: str) -> tuple[dict[str, Any], str]:
+    """Return the tables and the file name of a terrain, named or given by its file."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        known = sorted(path.stem for path in directory().glob("*.toml"))
+        if name not in known:
+            raise _unknown("terrain", name, known)
+        path = directory() / f"{name}.toml"
+    return config.load_toml(path), path.name
+
+
+def _numbers_of(c: config.Terrain, kind: str) -> _Numbers:
+    """Return the numbers of one kind, from the terrain's own file or from that which defines it."""
+    if kind not in KINDS:
+        raise _unknown("kind", kind, KINDS)
+    for name in [c.name, "mixed"]:
+        numbers = {} if Path(name).suffix in (".npy", ".png") else _numbers(name)
+        if kind in numbers:
+            return numbers[kind]
+    raise ConfigError(f"neither '{c.name}' nor 'mixed' has the kind '{kind}'")
+
+
+def _kinds(table: dict[str, Any], where: str) -> dict[str, _Numbers]:
+    """Return the numbers in the tables of a terrain file that defines kinds."""
+    if "mix" in table:
+        raise ConfigError(f"{where} is a mix itself; a mix names terrains that define kinds")
+    file = _record(_KindsFile, {"levels": {}, "shape": {}} | table, where)
+    if not 0.0 <= file.train[0] <= file.train[1]:
+        raise ConfigError(f"{where}: train must be [lowest, highest], not {list(file.train)}")
+    if not file.kinds:
+        raise ConfigError(f"{where}: kinds must name at least one of {', '.join(KINDS)}")
+    levels = _record(_Levels, file.levels, f"{where}: levels") if file.levels else None
+    numbers = {}
+    for kind in file.kinds:
+        if kind not in KINDS:
+            raise _unknown("kind", kind, KINDS)
+        shape = _record(KINDS[kind].shape, file.shape, f"{where}: shape")
+        _check_shape(file.shape, f"{where}: shape")
+        numbers[kind] = _Numbers(file.train, levels, shape)
+    return numbers
+
+
+def _check_shape(shape: dict[str, Any], where: str) -> None:
+    """Refuse numbers of a shape that no lane can be made of."""
+    for key, value in shape.items():
+        numbers = value if isinstance(value, list) else [value]
+        if not numbers or numbers[0] <= 0 or numbers != sorted(numbers):
+            raise ConfigError(f"{where}: {key} must be above zero and rising, not {value}")
+
+
+def _record(cls: type, table: dict[str, Any], where: str) -> Any:
+    """Return a table as the record `cls`, every field of which it must give."""
+    names = {f.name for f in dataclasses.fields(cls)}
+    missing = sorted(names - table.keys())
+    if missing and table.keys() <= names:
+        raise ConfigError(f"{where}: '{missing[0]}' is missing")
+    return config.override(object.__new__(cls), table, where=f"{where}: ")
+
+
+def _unknown(what: str, name: str, known: Iterable[str]) -> ConfigError:
+    """Return the error that names what is nearest to an unknown name."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    hint = f"did you mean '{near[0]}'? " if near else ""
+    return ConfigError(f"unknown {what} '{name}'; {hint}known: {', '.join(known)}")
+
+
+def _own_map(path: Path) -> Atlas:
+    """Return a user's height map as one lane whose start lies at x = MAP_START, y = 0, z = 0.
+
+    An array's first axis is x. A picture is seen from above: x to the right, y up.
+    """
+    heights = _picture(path) if path.suffix == ".png" else _array(path)
+    file_path = path.with_suffix(".toml")
+    table = config.load_toml(file_path)
+    file = _record(
+        _MapFile, ({} if path.suffix == ".png" else {"scale": 1.0}) | table, file_path.name
+    )
+    if not file.cell > 0.0:
+        raise ConfigError(f"{file_path.name}: cell must be above zero, not {file.cell}")
+    start = tuple(int(np.floor(metres / file.cell)) for metres in file.start)
+    if not all(0 <= s < n for s, n in zip(start, heights.shape, strict=True)):
+        size = " x ".join(f"{n * file.cell:g}" for n in heights.shape)
+        raise ConfigError(f"{file_path.name}: start {list(file.start)} is not on the map, {size} m")
+    heights = (heights - heights[start]) * file.scale
+    origin = (MAP_START - file.start[0], -file.start[1])
+    grid = terrain.from_heights(heights.astype(np.float32), file.cell, origin)
+    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape)
+
+
+def _array(path: Path) -> np.ndarray:
+    """Return the heights in a .npy file, f64[X, Y]."""
+    try:
+        heights = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise ConfigError(f"no file {path}") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if heights.ndim != 2 or 0 in heights.shape or heights.dtype.kind not in "fiu":
+        raise ConfigError(f"{path} must hold numbers [X, Y], not {heights.dtype}{heights.shape}")
+    _check_columns(heights.shape, str(path))
+    heights = heights.astype(np.float64)
+    if not np.isfinite(heights).all():
+        raise ConfigError(f"{path} has {np.sum(~np.isfinite(heights))} heights that are not finite")
+    return heights
+
+
+def _picture(path: Path) -> np.ndarray:
+    """Return the values of a grey .png of 8 or 16 bits, f64[X, Y]."""
+    try:
+        with Image.open(path) as image:
+            _check_columns(image.size, str(path))
+            if image.mode not in ("L", "I", "I;16", "I;16B"):
+                raise ConfigError(f"{path} must be grey with 8 or 16 bits, not {image.mode}")
+            return np.asarray(image)[::-1].T.astype(np.float64)
+    except FileNotFoundError:
+        raise ConfigError(f"no file {path}") from None
+    except (OSError, Image.DecompressionBombError) as error:
+        raise ConfigError(f"{path}: {error}") from None

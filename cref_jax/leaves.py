@@ -1,0 +1,98 @@
+"""The leaves of a state by their paths, and the digests that tell one state from another."""
+
+import hashlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+
+def digest(tree: PyTree) -> str:
+    """Return one SHA-256 over every path, shape, dtype and bit of `tree`: a policy's name tag."""
+    total = hashlib.sha256()
+    for path, array in sorted(on_host(tree).items()):
+        total.update(f"{path} {bits_digest(array)}\n".encode())
+    return total.hexdigest()
+
+
+def by_path(tree: PyTree, name: str = "") -> dict[str, Any]:
+    """Return the leaves by path, such as params/actor/kernel, under `name` if given.
+
+    Raises:
+        TypeError: a leaf is not an array.
+        ValueError: two leaves have one path.
+    """
+    flat, _ = jax.tree_util.tree_flatten_with_path(tree)
+    found = {_path(keys, name): leaf for keys, leaf in flat}
+    if len(found) < len(flat):
+        raise ValueError("two leaves of the state have the same path")
+    for path, leaf in found.items():
+        if not hasattr(leaf, "dtype"):
+            raise TypeError(f"{path} is a {type(leaf).__name__}, not an array")
+    return found
+
+
+def filled(like: PyTree, arrays: dict[str, Any], name: str = "") -> PyTree:
+    """Return `like` with the leaves that `arrays` has, paths as in `by_path`."""
+    return jax.tree_util.tree_map_with_path(
+        lambda keys, leaf: arrays.get(_path(keys, name), leaf), like
+    )
+
+
+def on_host(tree: PyTree) -> dict[str, np.ndarray]:
+    """Return the leaves by path as numpy arrays, random keys as their bits."""
+    host = jax.device_get({path: _bits(leaf) for path, leaf in by_path(tree).items()})
+    return {path: np.asarray(leaf) for path, leaf in host.items()}
+
+
+def placed(array: np.ndarray, like: Any, impl: str) -> Any:
+    """Return `array` as the kind of leaf that `like` is, on its devices.
+
+    `impl` names the generator if the leaf is a random key, and is empty otherwise.
+    """
+    if isinstance(like, np.ndarray | np.generic):
+        return array
+    leaf = jnp.array(array)  # a copy, because the state's buffers are donated
+    typed = jax.random.wrap_key_data(leaf, impl=impl) if impl else leaf
+    return jax.device_put(typed, like.sharding if getattr(like, "committed", False) else None)
+
+
+def empty(like: Any) -> np.ndarray:
+    """Return what `on_host` would, for a leaf of no elements."""
+    bits = jax.eval_shape(_bits, like)
+    return np.zeros(bits.shape, bits.dtype)
+
+
+def described(tree: PyTree, host: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    """Return shape, dtype, generator and SHA-256 of every leaf; `host` is what `on_host` gave."""
+    return {
+        path: {
+            "shape": list(leaf.shape),
+            "dtype": str(leaf.dtype),
+            "impl": str(jax.random.key_impl(leaf)) if _is_key(leaf) else "",
+            "sha256": bits_digest(host[path]),
+        }
+        for path, leaf in by_path(tree).items()
+    }
+
+
+def bits_digest(array: np.ndarray) -> str:
+    """Return the SHA-256 of dtype, shape and bits."""
+    total = hashlib.sha256(f"{array.dtype}{array.shape}".encode())
+    total.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return total.hexdigest()
+
+
+def _path(keys: tuple[Any, ...], name: str) -> str:
+    inner = jax.tree_util.keystr(keys, simple=True, separator="/")
+    return "/".join(part for part in (name, inner) if part)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _bits(leaf: Any) -> Any:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf

@@ -1,0 +1,108 @@
+"""What the policy and the critic see: Eq. 1-3."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cref_jax import config, geometry, terrain
+
+GRAVITY = np.array([0.0, 0.0, -1.0], np.float32)
+
+
+class Motion(NamedTuple):
+    """The robot's motion as its own sensors would report it without noise. Body frame, SI units."""
+
+    velocity: Float[Array, "3"]  # m/s
+    angular_velocity: Float[Array, "3"]  # rad/s
+    gravity: Float[Array, "3"]  # direction
+    joint_position: Float[Array, " J"]  # rad
+    joint_velocity: Float[Array, " J"]  # rad/s
+
+
+class Observation(NamedTuple):
+    """One robot's observation."""
+
+    proprioception: Float[Array, " O"]  # o^p_t, Eq. 2
+    privileged: Float[Array, " S"]  # s_t, Eq. 3
+    velocity: Float[Array, "3"]  # m/s, the velocity estimator's target
+
+
+def slices(num_joints: int) -> dict[str, slice]:
+    """Return where each part of o^p_t lies, in the order of Eq. 2."""
+    widths = {
+        "angular_velocity": 3,
+        "gravity": 3,
+        "command": 3,
+        "joint_position": num_joints,
+        "joint_velocity": num_joints,
+        "previous_action": num_joints,
+    }
+    ends = np.cumsum(list(widths.values()))
+    return {
+        name: slice(int(end) - width, int(end))
+        for (name, width), end in zip(widths.items(), ends, strict=True)
+    }
+
+
+def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"]) -> Motion:
+    """Return the motion in the body frame; MuJoCo's free joint has its velocity in the world's."""
+    rotation = qpos[3:7]
+    return Motion(
+        velocity=geometry.rotate_inverse(rotation, qvel[:3]),
+        angular_velocity=qvel[3:6],
+        gravity=geometry.rotate_inverse(rotation, jnp.asarray(GRAVITY)),
+        joint_position=qpos[7:],
+        joint_velocity=qvel[6:],
+    )
+
+
+def with_noise(clean: Motion, c: config.Randomisation, key: PRNGKeyArray) -> Motion:
+    """Return the motion with uniform sensor noise; the velocity, which no sensor has, stays."""
+    keys = jax.random.split(key, 4)
+    noise = lambda k, x, width: x + jax.random.uniform(k, x.shape, minval=-width, maxval=width)
+    return clean._replace(
+        angular_velocity=noise(keys[0], clean.angular_velocity, c.noise_angular_velocity),
+        gravity=noise(keys[1], clean.gravity, c.noise_gravity),
+        joint_position=noise(keys[2], clean.joint_position, c.noise_joint_position),
+        joint_velocity=noise(keys[3], clean.joint_velocity, c.noise_joint_velocity),
+    )
+
+
+def proprioception(
+    sensed: Motion,
+    command: Float[Array, "3"],
+    nominal_pose: Float[Array, " J"],
+    previous_action: Float[Array, " J"],
+) -> Float[Array, " O"]:
+    """o^p_t = [omega, r_grav, u_cmd, q - q_0, dq/dt, a_{t-1}], Eq. 2."""
+    return jnp.concatenate(
+        [
+            sensed.angular_velocity,
+            sensed.gravity,
+            command,
+            sensed.joint_position - nominal_pose,
+            sensed.joint_velocity,
+            previous_action,
+        ]
+    )
+
+
+def height_scan(
+    ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
+) -> Float[Array, " M"]:
+    """m_t: height of the base above a grid of ground points around it, m, less the nominal 0.6."""
+    x, y = np.meshgrid(np.linspace(*c.x), np.linspace(*c.y), indexing="ij")
+    grid = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
+    points = qpos[:2] + geometry.rotate_yaw(geometry.yaw(qpos[3:7]), jnp.asarray(grid))
+    clearance = qpos[2] - terrain.height_at(ground, points)
+    return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
+
+
+def privileged(
+    clean: Float[Array, " O"], velocity: Float[Array, "3"], scan: Float[Array, " M"]
+) -> Float[Array, " S"]:
+    """s_t = [o^p_t, v_t, m_t] without sensor noise, Eq. 3."""
+    return jnp.concatenate([clean, velocity, scan])

@@ -1,0 +1,370 @@
+"""Proximal policy optimisation for recurrent policies (Schulman et al. 2017).
+
+Knows nothing of robots. A rollout goes in as one record [T, E, ...], a train state comes out. Time
+is never split: a minibatch is some environments over the whole horizon, from their stored memory.
+Samples that are not `valid` count in no loss and in no statistic, whatever they hold.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
+
+from cref_jax import config
+
+OBSERVATION_CLIP = 10.0  # standard deviations; assumed: what lies beyond says nothing more
+_VARIANCE_FLOOR = 1e-4  # added to each input's variance; assumed: a constant input stays near 0
+_RATE_FACTOR = 1.5  # one adaptation of the learning rate; assumed: the usual factor
+_KL_BAND = 2.0  # the rate rests while the KL is within this factor of its target; assumed: usual
+_NEVER = 2**31 - 1  # bad gradients in a row before one is applied: when to stop is the caller's
+
+
+class Prediction(Protocol):
+    """What an actor says: a Gaussian over actions, and what it takes its velocity for."""
+
+    mean: Float[Array, "T E J"]
+    log_std: Float[Array, " J"]
+    velocity: Float[Array, "T E V"]
+
+
+class Networks(NamedTuple):
+    """The two functions that are trained. They take normalised observations."""
+
+    # (params, carry, obs [T, E, O], begins [T, E]) -> (carry, prediction)
+    actor: Callable[[PyTree, PyTree, Array, Array], tuple[PyTree, Prediction]]
+    # (params, critic_obs [T, E, S]) -> value [T, E]
+    critic: Callable[[PyTree, Array], Array]
+
+
+class Params(NamedTuple):
+    """What the optimiser changes."""
+
+    actor: PyTree
+    critic: PyTree
+
+
+class Statistics(NamedTuple):
+    """Running mean and deviation of what each network sees."""
+
+    obs: RunningStatisticsState
+    critic_obs: RunningStatisticsState
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that learning carries from one iteration to the next."""
+
+    params: Params
+    opt_state: optax.OptState  # holds the learning rate and the count of bad gradients, too
+    statistics: Statistics
+    iteration: Int[Array | jax.ShapeDtypeStruct, "*seeds"]  # or its shape alone, in eval_shape
+
+
+class Rollout(NamedTuple):
+    """T steps of E environments under one policy. Observations are raw."""
+
+    obs: Float[Array, "T E O"]
+    critic_obs: Float[Array, "T E S"]
+    velocity: Float[Array, "T E V"]  # what the estimator should have said
+    action: Float[Array, "T E J"]
+    mean: Float[Array, "T E J"]  # of the distribution that the action came from
+    log_std: Float[Array, "T E J"]  # of the distribution that the action came from
+    reward: Float[Array, "T E"]
+    value: Float[Array, "T E"]  # V of the state that the action was taken in
+    next_value: Float[Array, "T E"]  # V of the state that the step led to, before any reset
+    terminated: Bool[Array, "T E"]  # the episode ended in this step, and nothing follows
+    truncated: Bool[Array, "T E"]  # the episode was cut off after this step
+    begins: Bool[Array, "T E"]  # this step is the first of an episode: memory is empty before it
+    valid: Bool[Array, "T E"]  # False where the simulation failed; the next step must begin anew
+    carry: PyTree[Float[Array, "E ?H"]]  # the actor's memory before the first step
+
+
+class Batch(NamedTuple):
+    """What the loss looks at: a rollout normalised, judged and free of invalid numbers."""
+
+    obs: Float[Array, "T E O"]
+    critic_obs: Float[Array, "T E S"]
+    velocity: Float[Array, "T E V"]
+    action: Float[Array, "T E J"]
+    mean: Float[Array, "T E J"]
+    log_std: Float[Array, "T E J"]
+    value: Float[Array, "T E"]
+    advantage: Float[Array, "T E"]  # mean 0 and deviation 1 over the valid samples
+    returns: Float[Array, "T E"]
+    begins: Bool[Array, "T E"]
+    valid: Bool[Array, "T E"]
+    carry: PyTree[Float[Array, "E ?H"]]
+
+
+class Losses(NamedTuple):
+    """Unweighted parts of the loss of one minibatch, and how the step went."""
+
+    surrogate: Float[Array, "*n"]
+    value: Float[Array, "*n"]
+    velocity: Float[Array, "*n"]  # m^2/s^2
+    entropy: Float[Array, "*n"]  # nats
+    kl: Float[Array, "*n"]  # nats, of the behaviour policy from the present one
+    clipped: Float[Array, "*n"]  # share of samples whose ratio is outside the clip range
+    gradient_norm: Float[Array, "*n"] | float = 0.0  # before clipping
+    learning_rate: Float[Array, "*n"] | float = 0.0
+    skipped: Float[Array, "*n"] | float = 0.0  # 1 where the gradient was not finite
+
+
+def initial_state(params: Params, obs_size: int, critic_obs_size: int, c: config.PPO) -> TrainState:
+    """Return the state before the first iteration."""
+    floor = jnp.full((), _VARIANCE_FLOOR, jnp.float32)
+    empty = lambda n: running_statistics.init_state(jnp.zeros(n), std_eps=floor)
+    return TrainState(
+        params=params,
+        opt_state=optimiser(c).init(params),
+        statistics=Statistics(obs=empty(obs_size), critic_obs=empty(critic_obs_size)),
+        iteration=jnp.zeros((), jnp.int32),
+    )
+
+
+def optimiser(c: config.PPO) -> optax.GradientTransformationExtraArgs:
+    """Return Adam on clipped gradients, its rate a part of its state.
+
+    A gradient that is not finite is skipped, however many come in a row, and counted in the state
+    as `notfinite_count` (in a row) and `total_notfinite`.
+    """
+    adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
+    chain = optax.chain(optax.clip_by_global_norm(c.max_gradient_norm), adam)
+    return optax.apply_if_finite(chain, max_consecutive_errors=_NEVER)
+
+
+def update(
+    state: TrainState, rollout: Rollout, key: PRNGKeyArray, c: config.PPO, networks: Networks
+) -> tuple[TrainState, Losses]:
+    """Learn from one rollout; the losses are [epochs, minibatches].
+
+    The rollout is normalised by the statistics that it was made with. They learn of it at the end.
+    """
+    batch = judge(state.statistics, rollout, c)
+
+    def on_batch(state: TrainState, batch: Batch) -> tuple[TrainState, Losses]:
+        grads, losses = jax.grad(loss, has_aux=True)(state.params, batch, c, networks)
+        return _descend(state, grads, losses, c)
+
+    def on_epoch(state: TrainState, key: PRNGKeyArray) -> tuple[TrainState, Losses]:
+        return jax.lax.scan(on_batch, state, minibatches(batch, key, c.minibatches))
+
+    state, losses = jax.lax.scan(on_epoch, state, jax.random.split(key, c.epochs))
+    statistics = Statistics(
+        obs=observe(state.statistics.obs, rollout.obs, rollout.valid),
+        critic_obs=observe(state.statistics.critic_obs, rollout.critic_obs, rollout.valid),
+    )
+    return state.replace(statistics=statistics, iteration=state.iteration + 1), losses
+
+
+def judge(statistics: Statistics, rollout: Rollout, c: config.PPO) -> Batch:
+    """Return the rollout with advantages and returns, normalised.
+
+    An invalid step has the advantage 0 and passes none on: the steps before it are judged as if the
+    horizon had ended with them.
+    """
+    clean = _zero_invalid(rollout)
+    advantage = gae(
+        clean.reward,
+        clean.value,
+        clean.next_value,
+        clean.terminated | ~clean.valid,
+        clean.truncated,
+        c.gamma,
+        c.lam,
+    )
+    centred = advantage - _mean(advantage, clean.valid)
+    deviation = jnp.sqrt(_mean(jnp.square(centred), clean.valid))
+    return Batch(
+        obs=normalise(statistics.obs, clean.obs),
+        critic_obs=normalise(statistics.critic_obs, clean.critic_obs),
+        velocity=clean.velocity,
+        action=clean.action,
+        mean=clean.mean,
+        log_std=clean.log_std,
+        value=clean.value,
+        advantage=centred / (deviation + 1e-8),
+        returns=advantage + clean.value,
+        begins=clean.begins,
+        valid=clean.valid,
+        carry=clean.carry,
+    )
+
+
+def gae(
+    reward: Float[Array, "T E"],
+    value: Float[Array, "T E"],
+    next_value: Float[Array, "T E"],
+    terminated: Bool[Array, "T E"],
+    truncated: Bool[Array, "T E"],
+    gamma: float,
+    lam: float,
+) -> Float[Array, "T E"]:
+    """Return the generalised advantage estimates (Schulman et al. 2016).
+
+        d_t = r_t + gamma V(s'_t) [not terminated] - V(s_t)
+        A_t = d_t + gamma lam A_{t+1} [neither terminated nor truncated]
+
+    s'_t is the state that step t led to, before any reset. So nothing comes after a fall, while an
+    episode that was only cut off is worth what the critic expects of its last state.
+    """
+    delta = reward + gamma * jnp.where(terminated, 0.0, next_value) - value
+    decay = jnp.where(terminated | truncated, 0.0, gamma * lam)
+
+    def backwards(
+        later: Float[Array, " E"], step: tuple[Float[Array, " E"], Float[Array, " E"]]
+    ) -> tuple[Float[Array, " E"], Float[Array, " E"]]:
+        delta, decay = step
+        advantage = delta + decay * later
+        return advantage, advantage
+
+    _, advantage = jax.lax.scan(backwards, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)
+    return advantage
+
+
+def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:
+    """Return `count` random parts, each some environments over all time: [count, T, E', ...]."""
+    num_envs = batch.value.shape[1]
+    if num_envs % count:
+        raise ValueError(f"{num_envs} environments do not split into {count} equal minibatches")
+    order = jax.random.permutation(key, num_envs).reshape(count, num_envs // count)
+    split = jax.tree.map(lambda x: jnp.moveaxis(x[:, order], 1, 0), batch._replace(carry=()))
+    return split._replace(carry=jax.tree.map(lambda x: x[order], batch.carry))
+
+
+def loss(
+    params: Params, batch: Batch, c: config.PPO, networks: Networks
+) -> tuple[Float[Array, ""], Losses]:
+    """Return the weighted loss of a minibatch, and its parts."""
+    _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins)
+    value = networks.critic(params.critic, batch.critic_obs)
+    new = log_prob(batch.action, policy.mean, policy.log_std)
+    old = log_prob(batch.action, batch.mean, batch.log_std)
+    ratio = jnp.exp(jnp.where(batch.valid, new - old, 0.0))
+    divergence = kl(batch.mean, batch.log_std, policy.mean, policy.log_std)
+    error = jnp.sum(jnp.square(policy.velocity - batch.velocity), axis=-1)
+    parts = Losses(
+        surrogate=_mean(surrogate(ratio, batch.advantage, c.clip), batch.valid),
+        value=_mean(value_error(value, batch.value, batch.returns, c.value_clip), batch.valid),
+        velocity=_mean(error, batch.valid),
+        entropy=entropy(policy.log_std),
+        kl=_mean(divergence, batch.valid),
+        clipped=_mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype), batch.valid),
+    )
+    total = (
+        parts.surrogate
+        + c.value_weight * parts.value
+        + c.estimator_weight * parts.velocity
+        - c.entropy_weight * parts.entropy
+    )
+    return total, jax.lax.stop_gradient(parts)
+
+
+def surrogate(
+    ratio: Float[Array, "T E"], advantage: Float[Array, "T E"], clip: float
+) -> Float[Array, "T E"]:
+    """Return -min(r A, clip(r, 1 - clip, 1 + clip) A), the pessimistic policy loss."""
+    return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
+
+
+def value_error(
+    value: Float[Array, "T E"],
+    old: Float[Array, "T E"],
+    returns: Float[Array, "T E"],
+    clip: float,
+) -> Float[Array, "T E"]:
+    """Return the squared error of V, or of V held within `clip` of the old one if that is worse."""
+    held = old + jnp.clip(value - old, -clip, clip)
+    return jnp.maximum(jnp.square(value - returns), jnp.square(held - returns))
+
+
+def log_prob(
+    x: Float[Array, "*n J"], mean: Float[Array, "*n J"], log_std: Float[Array, "*#n J"]
+) -> Float[Array, "*n"]:
+    """Return log N(x; mean, std^2), summed over the independent coordinates."""
+    z = (x - mean) * jnp.exp(-log_std)
+    return -jnp.sum(0.5 * jnp.square(z) + log_std + 0.5 * math.log(2.0 * math.pi), axis=-1)
+
+
+def entropy(log_std: Float[Array, " J"]) -> Float[Array, ""]:
+    """Return the entropy of a Gaussian, sum of log std + log(2 pi e) / 2, in nats."""
+    return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
+
+
+def kl(
+    mean: Float[Array, "*n J"],
+    log_std: Float[Array, "*n J"],
+    new_mean: Float[Array, "*n J"],
+    new_log_std: Float[Array, " J"],
+) -> Float[Array, "*n"]:
+    """Return KL(old || new) of two Gaussians, in nats.
+
+    sum of log(s'/s) + (s^2 + (m - m')^2) / (2 s'^2) - 1/2
+    """
+    growth = new_log_std - log_std
+    shift = (mean - new_mean) * jnp.exp(-new_log_std)
+    return jnp.sum(growth + 0.5 * (jnp.exp(-2.0 * growth) + jnp.square(shift) - 1.0), axis=-1)
+
+
+def adapt(rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO) -> Float[Array, ""]:
+    """Return the learning rate, lower if the policy moved too far and higher if not far enough.
+
+    A KL of 0 (nothing has moved yet) or NaN leaves it as it is.
+    """
+    low, high = c.learning_rate_range
+    slower = kl > _KL_BAND * c.target_kl
+    faster = (kl > 0.0) & (kl < c.target_kl / _KL_BAND)
+    factor = jnp.where(slower, 1.0 / _RATE_FACTOR, jnp.where(faster, _RATE_FACTOR, 1.0))
+    return jnp.clip(rate * factor, low, high)
+
+
+def normalise(statistics: RunningStatisticsState, x: Float[Array, "*n O"]) -> Float[Array, "*n O"]:
+    """Return (x - mean) / std, within +-OBSERVATION_CLIP."""
+    return running_statistics.normalize(x, statistics, max_abs_value=OBSERVATION_CLIP)
+
+
+def observe(
+    statistics: RunningStatisticsState, x: Float[Array, "T E O"], valid: Bool[Array, "T E"]
+) -> RunningStatisticsState:
+    """Return the statistics with the valid samples counted in."""
+    clean = jnp.where(valid[..., None], x, 0.0)
+    after = running_statistics.update(statistics, clean, weights=valid.astype(x.dtype))
+    return jax.tree.map(lambda new, old: jnp.where(valid.any(), new, old), after, statistics)
+
+
+def _descend(
+    state: TrainState, grads: Params, losses: Losses, c: config.PPO
+) -> tuple[TrainState, Losses]:
+    """Take one step of the optimiser at the rate that the KL asks for."""
+    rate = adapt(optax.tree.get(state.opt_state, "learning_rate"), losses.kl, c)
+    opt_state = optax.tree.set(state.opt_state, learning_rate=rate)
+    changes, opt_state = optimiser(c).update(grads, opt_state, state.params)
+    state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)
+    return state, losses._replace(
+        gradient_norm=optax.tree.norm(grads),
+        learning_rate=rate,
+        skipped=(~opt_state.last_finite).astype(rate.dtype),
+    )
+
+
+def _mean(x: Float[Array, "T E"], valid: Bool[Array, "T E"]) -> Float[Array, ""]:
+    """Return the mean over the valid samples, 0 if there are none."""
+    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def _zero_invalid(rollout: Rollout) -> Rollout:
+    """Return the rollout with zeros in place of the numbers of invalid samples."""
+
+    def keep(x: Shaped[Array, "T E *n"]) -> Shaped[Array, "T E *n"]:
+        valid = rollout.valid.reshape(rollout.valid.shape + (1,) * (x.ndim - 2))
+        return jnp.where(valid, x, jnp.zeros_like(x))
+
+    clean = jax.tree.map(keep, rollout._replace(carry=()))
+    return clean._replace(begins=rollout.begins, carry=rollout.carry)

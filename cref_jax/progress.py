@@ -1,0 +1,121 @@
+"""What a run says while it works: live on a terminal, plain lines elsewhere, always files."""
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from tensorboardX import SummaryWriter
+
+PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
+SHOWN = {  # name in the log: name on the screen and unit
+    "walk/speed_error": ("speed error", "m/s"),
+    "walk/forward_speed": ("forward speed", "m/s"),
+    "episode/length_s": ("episode length", "s"),
+    "episode/falls_per_minute": ("falls", "a robot and minute"),
+    "walk/reward": ("reward", "a step"),
+    "train/action_std": ("action deviation", ""),
+    "loss/kl": ("KL", "nats"),
+    "train/learning_rate": ("learning rate", ""),
+}
+
+
+class Reporter:
+    """Writes every iteration to `log.jsonl` and TensorBoard, and shows the newest figures."""
+
+    def __init__(
+        self, run: Path, first: int, last: int, samples: int, tensorboard: bool = True
+    ) -> None:
+        """Report iterations `first` to `last` of `samples` samples each."""
+        self.console = Console()
+        self._file = (run / "log.jsonl").open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(run / "tensorboard")) if tensorboard else None
+        self._last, self._samples = last, samples
+        self._live: Live | None = None
+        self._bar = Progress(
+            TextColumn("iteration"),
+            MofNCompleteColumn(),
+            BarColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=self.console,
+            auto_refresh=False,
+        )
+        self._task = self._bar.add_task("train", total=last, completed=first, rate="")
+        self._said = 0.0
+
+    def __enter__(self) -> "Reporter":
+        if self.console.is_terminal:
+            self._live = Live(self._bar, console=self.console, refresh_per_second=4)
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live:
+            self._live.stop()
+        if self._board:
+            self._board.close()
+        self._file.close()
+
+    def say(self, line: str) -> None:
+        """Print one line above the table."""
+        self.console.print(line, highlight=False, soft_wrap=True)
+
+    def chunk(self, first: int, log: Mapping[str, np.ndarray], seconds: float) -> None:
+        """Report the iterations `first` + 1, ..., that took `seconds` together."""
+        count = len(next(iter(log.values())))
+        rate = count * self._samples / seconds
+        for i in range(count):
+            row = {name: float(values[i]) for name, values in log.items()}
+            line = {"iteration": first + i + 1, "samples_per_s": round(rate), **_rounded(row)}
+            self._file.write(json.dumps(line) + "\n")
+            if self._board:
+                for name, value in row.items():
+                    self._board.add_scalar(name, value, first + i + 1)
+        self._file.flush()
+        self._show(first + count, {name: float(v.mean()) for name, v in log.items()}, rate)
+
+    def _show(self, iteration: int, newest: Mapping[str, float], rate: float) -> None:
+        self._bar.update(self._task, completed=iteration, rate=f"{rate:,.0f} samples/s")
+        if self._live:
+            self._live.update(Group(self._bar, _table(newest)))
+        elif time.monotonic() - self._said > PLAIN_SECONDS or iteration >= self._last:
+            self._said = time.monotonic()
+            task = self._bar.tasks[0]
+            left = f"{task.time_remaining / 60:.0f} min left" if task.time_remaining else ""
+            figures = ", ".join(
+                f"{title} {newest[name]:.3g}{' ' + unit if unit else ''}"
+                for name, (title, unit) in SHOWN.items()
+                if name in newest
+            )
+            self.say(f"{iteration}/{self._last}: {rate:,.0f} samples/s, {left}; {figures}")
+
+
+def _table(newest: Mapping[str, float]) -> Table:
+    """Return the figures that are shown, and level and falls by kind of terrain."""
+    table = Table.grid(padding=(0, 2))
+    for name, (title, unit) in SHOWN.items():
+        if name in newest:
+            table.add_row(title, f"{newest[name]:.4g} {unit}")
+    for name, level in newest.items():
+        if name.startswith("level/"):
+            kind = name.removeprefix("level/")
+            table.add_row(kind, f"level {level:.1f}, {newest[f'fell/{kind}']:.0%} of episodes fall")
+    return table
+
+
+def _rounded(row: Mapping[str, float]) -> dict[str, float | None]:
+    """Return the row with six digits, and None for what is not finite, which JSON cannot hold."""
+    return {k: float(f"{v:.6g}") if np.isfinite(v) else None for k, v in row.items()}

@@ -1,0 +1,135 @@
+"""What a run leaves on disk, and how a later program opens it again.
+
+runs/NAME/config.json     every setting, so that the run can be resumed or evaluated
+runs/NAME/origin.jsonl    versions, device, command line and git state at each start
+runs/NAME/log.jsonl       one line an iteration
+runs/NAME/tensorboard/    the same for TensorBoard
+runs/NAME/checkpoints/    see checkpoint.py
+"""
+
+import dataclasses
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from cref_jax import config, learn, ppo
+from cref_jax.checkpoint import Checkpoints
+from cref_jax.config import Config, ConfigError
+from cref_jax.physics import EngineName, Physics, resolve_engine
+from cref_jax.world import World, make_world
+
+ROOT = Path("runs")
+
+
+class Policy(NamedTuple):
+    """A trained policy and how it came about."""
+
+    config: Config
+    train: ppo.TrainState
+    iteration: int
+    run: Path
+
+
+def write_config(run: Path, c: Config) -> None:
+    """Write every setting of the run."""
+    (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+
+
+def write_origin(run: Path) -> None:
+    """Add a line with what this start of the run is made by: versions, device, command, git."""
+    packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    line = {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
+        "cores": os.cpu_count(),
+        "git": _git_state(),
+        **{name: importlib.metadata.version(name) for name in packages},
+    }
+    with (run / "origin.jsonl").open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def data_folder(name: str) -> Path:
+    """Return `experiments` or `terrains`: inside an installed package, or beside it."""
+    inside = Path(__file__).parent / name
+    return inside if inside.is_dir() else Path(__file__).parents[1] / name
+
+
+def read_config(run: Path) -> Config:
+    """Return the settings of a run.
+
+    Raises:
+        ConfigError: there is no such run, or its settings are of another version of the program.
+    """
+    path = run / "config.json"
+    try:
+        changes = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"{run} is not a run: it has no config.json") from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    try:
+        return config.override(Config(), changes)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def newest(root: Path = ROOT) -> Path:
+    """Return the run with the newest checkpoint.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = [
+        path.parent for path in root.glob("*/checkpoints") if Checkpoints(path).latest() is not None
+    ]
+    if not found:
+        raise ConfigError(f"no trained run in {root}/; train one with: make train TERRAIN=flat")
+    return max(found, key=lambda run: (run / "checkpoints").stat().st_mtime)
+
+
+def checkpoints(run: Path, keep: int = 3) -> Checkpoints:
+    """Return the checkpoints of a run."""
+    return Checkpoints(run / "checkpoints", keep)
+
+
+def world_of(c: Config, engine: EngineName = "auto") -> World:
+    """Return the world that a configuration describes."""
+    return make_world(c, Physics(c.robot, c.physics, resolve_engine(engine)))
+
+
+def load_policy(run: Path, world: World) -> Policy:
+    """Return the newest policy of a run; `world` may have another terrain than it was trained on.
+
+    Raises:
+        ConfigError: there is no such run.
+        CheckpointError: it has no checkpoint that can be read.
+    """
+    like = jax.eval_shape(lambda w: learn.initial_state(w).train, world)
+    c = read_config(run)
+    with checkpoints(run) as steps:
+        newest = steps.latest()
+        train = steps.restore_part("train", like, newest)
+        return Policy(c, train, newest or 0, run)
+
+
+def _git_state() -> str | None:
+    """Return the commit that the program is of, marked when it has been changed since."""
+    try:
+        here = Path(__file__).parent
+        ask = lambda *words: subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -1,0 +1,268 @@
+"""The picture of the world: the whole robot on its lane, as a MuJoCo model to draw.
+
+The lane is a slab on a plain. Columns of equal height are merged into boxes, in two tones so that
+motion shows: the tone changes with each tread and with each metre. Where too many boxes would be
+needed, as on a slope or on noise, a height field is drawn through the columns' middles instead.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from cref_jax import config, robot
+from cref_jax.config import ConfigError
+from cref_jax.terrain import Terrain
+
+Frame = UInt8[np.ndarray, "height width 3"]
+
+GROUND = 0  # geom group of the lane and of the plain; the robot's shapes are in 2 and 3
+MOST_BOXES = 500  # beyond, a height field; stairs take some 150, a slope 1000
+MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU
+TILE = 1.0  # m, between two changes of tone
+BASE = 0.1  # m, from the plain to the lowest column
+TONES = ((0.80, 0.78, 0.74), (0.66, 0.65, 0.63))  # red, green, blue
+PLAIN = (0.70, 0.74, 0.78)
+SKY = ((0.30, 0.47, 0.68), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
+
+AZIMUTH = 128.0  # deg, where the camera looks: the robot comes from the left, seen from the front
+ELEVATION = -13.0  # deg
+DISTANCE = 4.2  # m, from the camera to the pelvis
+VIEW = 32.0  # deg, vertical
+CALM = 1.0  # s of the pelvis's way that the camera averages over
+
+
+class Boxes(NamedTuple):
+    """Rectangles of columns of one height and tone, B of them."""
+
+    first: Int[np.ndarray, "B 2"]  # column
+    size: Int[np.ndarray, "B 2"]  # columns
+    height: Float[np.ndarray, " B"]  # m
+    tone: Int[np.ndarray, " B"]  # index into TONES
+
+
+def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) -> mujoco.MjModel:
+    """Return the model to draw; its qpos is that of the physics, its x and y those of `ground`."""
+    spec = robot.spec(actuated, physics, contact_planes=0, visual=True)
+    heights, origin = window(ground)
+    _add_light(spec)
+    _add_plain(spec, float(heights.min()) - BASE)
+    found = boxes(heights, round(TILE / ground.cell))
+    if found is None:
+        _add_field(spec, heights, origin, ground.cell)
+    else:
+        _add_boxes(spec, found, origin, ground.cell)
+    return spec.compile()
+
+
+def window(ground: Terrain) -> tuple[Float[np.ndarray, "X Y"], Float[np.ndarray, "2"]]:
+    """Return the heights of the columns in the terrain's window, and its outer corner, m."""
+    first, size = np.asarray(ground.first), np.asarray(ground.size)
+    rows, columns = (slice(f, f + s) for f, s in zip(first, size, strict=True))
+    return np.asarray(ground.heights)[rows, columns], np.asarray(ground.origin)
+
+
+def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) -> Boxes | None:
+    """Return boxes that cover every column once, or None if more than `most` would be needed.
+
+    Greedy: from the first column that is left, as far as possible across, then along.
+    """
+    tone = _tones(heights, tile)
+    left = np.ones(heights.shape, bool)
+    found: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    while left.any():
+        if len(found) == most:
+            return None
+        i, j = np.unravel_index(np.argmax(left), left.shape)
+        same = left & (heights == heights[i, j]) & (tone == tone[i, j])
+        across = _run(same[i, j:])
+        along = _run(same[i:, j : j + across].all(axis=1))
+        left[i : i + along, j : j + across] = False
+        found.append(((int(i), int(j)), (along, across)))
+    first, size = (np.array(part, np.int32) for part in zip(*found, strict=True))
+    at = tuple(first.T)
+    return Boxes(first, size, heights[at], tone[at])
+
+
+class Canvas:
+    """A surface off the screen to draw one model on."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        """Open the surface.
+
+        Raises:
+            ConfigError: this machine has no OpenGL.
+        """
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._model, self._data = model, mujoco.MjData(model)
+        self._camera = mujoco.MjvCamera()
+        self._camera.azimuth, self._camera.elevation = AZIMUTH, ELEVATION
+        self._camera.distance = DISTANCE
+        try:
+            self._renderer = mujoco.Renderer(model, height, width)
+        except Exception as error:  # each backend raises its own kinds
+            raise ConfigError(
+                "cannot draw without OpenGL; on Debian and Ubuntu: "
+                "apt install libegl1 libosmesa6 libgl1"
+            ) from error
+
+    def __enter__(self) -> "Canvas":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):  # some drivers fail here, with the work done
+            self._renderer.close()
+
+    def draw(self, qpos: Float[np.ndarray, " Q"], look_at: Float[np.ndarray, "3"]) -> Frame:
+        """Return the picture of the robot in this pose, the camera turned to a point of space."""
+        self._data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, self._data)
+        self._camera.lookat[:] = look_at
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+    def film(self, qpos: Float[np.ndarray, "T Q"], period: float) -> Iterator[Frame]:
+        """Yield the picture of each pose, the camera following the pelvis; `period` in s."""
+        for pose, point in zip(qpos, smoothed(qpos[:, :3], CALM / period), strict=True):
+            yield self.draw(pose, point)
+
+
+def smoothed(path: Float[np.ndarray, "T 3"], width: float) -> Float[np.ndarray, "T 3"]:
+    """Return the path averaged over `width` points around each; its ends are held, not moved."""
+    half = min(round(width / 2), len(path) - 1)
+    weights = np.hanning(2 * half + 3)[1:-1]
+    weights /= weights.sum()
+    # reflected through its end points, a straight path stays what it is
+    before = 2 * path[:1] - path[half:0:-1]
+    after = 2 * path[-1:] - path[-2 : -2 - half : -1]
+    padded = np.concatenate([before, path, after])
+    return np.stack([np.convolve(axis, weights, mode="valid") for axis in padded.T], axis=1)
+
+
+def _tones(heights: Float[np.ndarray, "X Y"], tile: int) -> Int[np.ndarray, "X Y"]:
+    """Return 0 or 1 for each column: a checkerboard that begins anew at each change of height."""
+    x, y = np.arange(heights.shape[0])[:, None], np.arange(heights.shape[1])
+    rises = np.diff(heights, axis=0, prepend=heights[:1]) != 0.0
+    since = x - np.maximum.accumulate(np.where(rises, x, 0), axis=0)
+    # a stretch's number and the tiles in it: the two tones alternate at both kinds of border
+    turns = rises | ((since > 0) & (since % tile == 0))
+    return (np.cumsum(turns, axis=0) + y // tile) % 2
+
+
+def _run(flags: Bool[np.ndarray, " n"]) -> int:
+    """Return how many flags are true before the first that is not."""
+    return len(flags) if flags.all() else int(np.argmin(flags))
+
+
+def _add_boxes(
+    spec: mujoco.MjSpec, found: Boxes, origin: Float[np.ndarray, "2"], cell: float
+) -> None:
+    """Add one geom a box, all standing on the plain."""
+    bottom = found.height.min() - BASE
+    for first, size, height, tone in zip(*found, strict=True):
+        half = 0.5 * (height - bottom)
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[*(origin + (first + 0.5 * size) * cell), height - half],
+            size=[*(0.5 * size * cell), half],
+            rgba=[*TONES[tone], 1.0],
+            contype=0,
+            conaffinity=0,
+            group=GROUND,
+        )
+
+
+def _add_field(
+    spec: mujoco.MjSpec,
+    heights: Float[np.ndarray, "X Y"],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
+) -> None:
+    """Add a height field whose vertices are the columns' middles, thinned out on a huge map."""
+    step = int(np.ceil(np.sqrt(heights.size / MOST_VERTICES)))
+    heights = heights[::step, ::step]
+    low, rise = float(heights.min()), float(np.ptp(heights))
+    extent = (np.array(heights.shape) - 1) * step * cell
+    spec.add_hfield(
+        name="lane",
+        nrow=heights.shape[1],  # along y
+        ncol=heights.shape[0],
+        size=[*(0.5 * extent), max(rise, 1e-3), BASE],
+        userdata=((heights - low) / max(rise, 1e-3)).T.ravel(),
+    )
+    _add_checker(spec, "lane", TONES, repeat=0.5 / TILE)
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_HFIELD,
+        hfieldname="lane",
+        material="lane",
+        pos=[*(origin + 0.5 * (cell + extent)), low],
+        contype=0,
+        conaffinity=0,
+        group=GROUND,
+    )
+
+
+def _add_plain(spec: mujoco.MjSpec, z: float) -> None:
+    """Add an endless plane under the lane, which the haze leads over into the sky."""
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[0.0, 0.0, z],
+        size=[0.0, 0.0, 1.0],  # without bounds
+        rgba=[*PLAIN, 1.0],
+        contype=0,
+        conaffinity=0,
+        group=GROUND,
+    )
+
+
+def _add_checker(
+    spec: mujoco.MjSpec, name: str, tones: tuple[tuple[float, ...], ...], repeat: float
+) -> None:
+    """Add a material with two fields of each tone a period, `repeat` periods a metre."""
+    spec.add_texture(
+        name=name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=tones[0],
+        rgb2=tones[1],
+        width=256,
+        height=256,
+    )
+    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    spec.add_material(name=name, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
+
+
+def _add_light(spec: mujoco.MjSpec) -> None:
+    """Add the sky, soft light from everywhere, and a sun above the robot that casts shadows."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=SKY[0],
+        rgb2=SKY[1],
+        width=256,
+        height=1536,
+    )
+    spec.body("pelvis").add_light(
+        pos=[-1.5, -2.5, 5.0],
+        dir=[0.3, 0.5, -1.0],
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        diffuse=[0.62, 0.60, 0.56],
+        specular=[0.2, 0.2, 0.2],
+        castshadow=True,
+    )
+    visual = spec.visual
+    visual.headlight.ambient = [0.42, 0.43, 0.45]
+    visual.headlight.diffuse = [0.18, 0.18, 0.18]
+    visual.headlight.specular = [0.0, 0.0, 0.0]
+    visual.rgba.haze = [*SKY[1], 1.0]
+    visual.global_.fovy = VIEW
+    visual.quality.shadowsize = 4096
+    visual.map.shadowclip = 2.0  # of the extent: half the side of the square with shadows
+    visual.map.zfar = 50.0  # of the extent
+    spec.stat.extent = 2.0  # m

@@ -1,0 +1,188 @@
+"""The ground: one grid of columns that contact, depth, height scan and foothold reward all read.
+
+Column (i, j) of a `Terrain` is a box, filled from minus infinity up to `heights[i, j]`, so a riser
+is truly vertical. All robots share one array of heights. A robot sees a window of it, its lane;
+outside of the window the heights of its border continue. Frames: x along the lane, z up.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+FAR = 1.0  # m, distance of a contact plane that is not there
+_TOUCHING = 1e-6  # m, no distance is taken as shorter, so that every direction has a length
+_NEIGHBOURS = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
+_ABOVE = 1e-5  # m, a second contact lies further than this in front of the first one's plane
+
+
+@flax.struct.dataclass
+class Terrain:
+    """A window of a grid of columns."""
+
+    heights: Float[Array, "X Y"]  # m, of the whole grid
+    origin: Float[Array, " 2"]  # m, outer corner of the window's first column
+    first: Int[Array, " 2"]  # the window's first column
+    size: Int[Array, " 2"]  # columns in the window
+    cell: float = flax.struct.field(pytree_node=False)  # m, side of a column
+
+
+def from_heights(
+    heights: Float[ArrayLike, "X Y"], cell: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> Terrain:
+    """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell."""
+    heights = jnp.asarray(heights, jnp.float32)
+    return Terrain(
+        heights=heights,
+        origin=jnp.asarray(origin, jnp.float32),
+        first=jnp.zeros(2, jnp.int32),
+        size=jnp.asarray(heights.shape, jnp.int32),
+        cell=float(cell),
+    )
+
+
+def tile(
+    terrain: Terrain,
+    size: tuple[int, int],
+    row: Int[ArrayLike, ""],
+    column: Int[ArrayLike, ""],
+) -> Terrain:
+    """Return tile (row, column) of a grid divided into tiles of `size` columns.
+
+    Every tile has the coordinates of tile (0, 0), so positions stay small and float32 stays exact.
+    The heights are shared, not copied: under vmap over row and column they stay without that axis.
+    """
+    size_ij = jnp.asarray(size, jnp.int32)
+    place = jnp.stack([jnp.asarray(row, jnp.int32), jnp.asarray(column, jnp.int32)])
+    return dataclasses.replace(terrain, first=terrain.first + place * size_ij, size=size_ij)
+
+
+def height_at(terrain: Terrain, xy: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
+    """Return the height of the ground under each point, m."""
+    columns = jnp.floor((jnp.asarray(xy) - terrain.origin) * (1.0 / terrain.cell))
+    return _height(terrain, columns[..., 0].astype(jnp.int32), columns[..., 1].astype(jnp.int32))
+
+
+def closest_point(
+    terrain: Terrain, p: Float[Array, " 3"]
+) -> tuple[Float[Array, " 3"], Float[Array, " 3"], Float[Array, ""]]:
+    """Return the closest point of the surface, the outward unit normal there and the distance.
+
+    The distance is negative inside the ground. The 3 x 3 columns around `p` are searched, so the
+    result is exact (to `_TOUCHING`) where the distance is below one cell, as for a contact sphere
+    of that radius. Further up it is the closest point of these columns. At an edge the normal
+    points from the edge to `p`; of two equally close points the one of p's own column is taken.
+    """
+    offsets, outside = _offsets(terrain, p)
+    nearest = _nearest(offsets)
+    return _plane(p, nearest, outside)
+
+
+def contact_planes(
+    terrain: Terrain, p: Float[Array, " 3"], count: int = 1
+) -> tuple[Float[Array, "count 3"], Float[Array, "count 3"], Float[Array, " count"]]:
+    """Return points, normals and distances of the surfaces that a sphere at `p` may touch.
+
+    The first is `closest_point`. The second is the closest whose normal differs by more than 45
+    degrees and which stands out of the first one's tangent plane: in the corner of a stair a sphere
+    touches tread and riser at once. Where there is none, a level plane lies `FAR` below.
+    """
+    if count not in (1, 2):
+        raise ValueError(f"a sphere has 1 or 2 contact planes, not {count}")
+    offsets, outside = _offsets(terrain, p)
+    nearest = _nearest(offsets)
+    planes = [_plane(p, nearest, outside)]
+    if count == 2:
+        planes.append(_second_plane(p, offsets, nearest, outside))
+    points, normals, distances = zip(*planes, strict=True)
+    return jnp.stack(points), jnp.stack(normals), jnp.stack(distances)
+
+
+class _Offset(NamedTuple):
+    """From `p` to the closest point of one column: a vector and its square, as scalars, m.
+
+    Scalars and not vectors: XLA then makes one loop over all points of all robots of the whole
+    search, with nothing in memory but the heights.
+    """
+
+    x: Float[Array, ""]
+    y: Float[Array, ""]
+    z: Float[Array, ""]
+    square: Float[Array, ""]
+
+
+def _offsets(terrain: Terrain, p: Float[Array, " 3"]) -> tuple[list[_Offset], Float[Array, ""]]:
+    """Return the ways from `p` to the 9 columns, its own first, and 1 outside, -1 inside.
+
+    Outside of the ground a column's closest point is sought in the box below its height, inside
+    of the ground in the air above it.
+    """
+    x = (p[0] - terrain.origin[0]) * (1.0 / terrain.cell)  # columns
+    y = (p[1] - terrain.origin[1]) * (1.0 / terrain.cell)
+    i, j = jnp.floor(x), jnp.floor(y)
+    # barrier: rounded differently in the length and in the vector, a normal would not be a unit
+    u, v = jax.lax.optimization_barrier((x - i, y - j))
+    east = jnp.clip(u * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
+    north = jnp.clip(v * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
+    to_x = {-1: -east, 0: jnp.zeros_like(east), 1: terrain.cell - east}
+    to_y = {-1: -north, 0: jnp.zeros_like(north), 1: terrain.cell - north}
+    i, j = i.astype(jnp.int32), j.astype(jnp.int32)
+
+    own = _height(terrain, i, j) - p[2]
+    outside = jnp.where(own <= 0.0, 1.0, -1.0)
+    z = -outside * jnp.maximum(jnp.abs(own), 0.5 * _TOUCHING)  # half: its own column comes first
+    offsets = [_Offset(jnp.zeros_like(z), jnp.zeros_like(z), z, z * z)]
+    for a, b in _NEIGHBOURS:
+        z = _height(terrain, i + a, j + b) - p[2]
+        z = -outside * jnp.maximum(-outside * z, 0.0)
+        square = to_x[a] * to_x[a] + to_y[b] * to_y[b] + z * z
+        offsets.append(_Offset(to_x[a], to_y[b], z, square))
+    return offsets, outside
+
+
+def _height(terrain: Terrain, i: Int[Array, "..."], j: Int[Array, "..."]) -> Float[Array, "..."]:
+    """Return the height of column (i, j) of the window, or of the nearest one inside of it."""
+    i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
+    j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
+    flat = i * terrain.heights.shape[1] + j
+    return terrain.heights.reshape(-1).at[flat].get(mode="promise_in_bounds")
+
+
+def _nearest(offsets: list[_Offset]) -> _Offset:
+    """Return the shortest offset, the first of equally short ones."""
+    best = offsets[0]
+    for other in offsets[1:]:
+        best = _choose(other.square < best.square, other, best)
+    return best
+
+
+def _second_plane(
+    p: Float[Array, " 3"], offsets: list[_Offset], nearest: _Offset, outside: Float[Array, ""]
+) -> tuple[Float[Array, " 3"], Float[Array, " 3"], Float[Array, ""]]:
+    """Return the plane of the nearest other surface, or one `FAR` below `p`."""
+    zero = jnp.zeros_like(p[0])
+    none = _Offset(zero, zero, zero - FAR, zero + FAR * FAR)
+    second = none
+    for other in offsets:
+        along = other.x * nearest.x + other.y * nearest.y + other.z * nearest.z
+        turned = (along <= 0.0) | (along * along < 0.5 * other.square * nearest.square)
+        in_front = nearest.square - along > _ABOVE * jnp.sqrt(nearest.square)
+        second = _choose(turned & in_front & (other.square < second.square), other, second)
+    return _plane(p, _choose(outside > 0.0, second, none), jnp.ones_like(outside))
+
+
+def _choose(condition: Bool[Array, ""], yes: _Offset, no: _Offset) -> _Offset:
+    """Return one of two offsets."""
+    return _Offset(*(jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True)))
+
+
+def _plane(
+    p: Float[Array, " 3"], offset: _Offset, outside: Float[Array, ""]
+) -> tuple[Float[Array, " 3"], Float[Array, " 3"], Float[Array, ""]]:
+    """Return the surface point an offset from `p` leads to, the normal there and the distance."""
+    vector = jnp.stack([offset.x, offset.y, offset.z])
+    length = jnp.sqrt(offset.square)
+    return p + vector, vector * (-outside / length), outside * length

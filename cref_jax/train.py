@@ -1,0 +1,273 @@
+"""Train a policy: `python -m cref_jax.train --terrain gap`."""
+
+import dataclasses
+import datetime
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from cref_jax import cli, config, evaluation, learn, runs
+from cref_jax.checkpoint import Checkpoints, lock
+from cref_jax.config import Config, ConfigError
+from cref_jax.physics import EngineName, resolve_engine
+from cref_jax.progress import Reporter
+from cref_jax.world import World
+
+MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
+
+Device = Literal["auto", "cpu", "gpu"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked for besides the settings of the run."""
+
+    terrain: str = "flat"
+    """flat, rough, slope, stairs, gap, platform, mixed, or a height map: path.npy, path.png"""
+    experiment: str | None = None
+    """a file in experiments/ (without .toml) or a path: differences from the defaults"""
+    num_envs: int | None = None
+    """robots at once; short for --run.num-envs"""
+    iterations: int | None = None
+    """iterations in all; short for --run.iterations"""
+    seed: int | None = None
+    """short for --run.seed"""
+    engine: EngineName = "auto"
+    """mujoco steps on the CPU, mjx on the device"""
+    device: Device = "auto"
+    """where the program runs; gpu is an error without one"""
+    run_dir: Path | None = None
+    """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
+    resume: bool = False
+    """go on with the run in --run-dir, or with the newest one"""
+    print_config: bool = False
+    """print every setting as JSON and stop"""
+    tensorboard: bool = True
+    """write TensorBoard files, too"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train a policy. Every setting of the run is an option, too."""
+
+    options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    with cli.one_line_errors(debug="--debug" in arguments):
+        options, c = parse(arguments)
+        if options.print_config:
+            print(json.dumps(dataclasses.asdict(c), indent=2))
+            return
+        train(options, c)
+
+
+def parse(arguments: list[str]) -> tuple[Options, Config]:
+    """Return what the command line asks for.
+
+    The settings are the paper's, changed by the device's preset, by the experiment and by the
+    command line, in this order; those of a run that is resumed are its own.
+
+    Raises:
+        ConfigError: a value that cannot be used, an unknown terrain or experiment.
+    """
+    asked = [a for a in arguments if a not in ("-h", "--help")]
+    options, _ = tyro.cli(Options, args=asked, return_unknown_args=True)
+    options = dataclasses.replace(options, device=select_device(options.device))
+    if options.resume:
+        run = options.run_dir or runs.newest()
+        options = dataclasses.replace(options, run_dir=run)
+        base = runs.read_config(run)
+    else:
+        base = composed(options)
+    default = Command(options, base)
+    command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
+    c = _with_short_options(command.settings, command.options)
+    config.check(c)
+    return dataclasses.replace(command.options, device=options.device), c
+
+
+def composed(options: Options) -> Config:
+    """Return the settings before the command line has its say."""
+    c = config.override(Config(), {"terrain": {"name": options.terrain}})
+    preset = config.load_toml(_experiment("presets")).get(options.device, {})
+    for_terrain = preset.pop(options.terrain, {})
+    known = {f.name for f in dataclasses.fields(Config)}
+    c = config.override(c, {k: v for k, v in preset.items() if k in known})
+    c = config.override(c, for_terrain)
+    if options.experiment:
+        c = config.override(c, config.load_toml(_experiment(options.experiment)))
+    return c
+
+
+def select_device(device: Device) -> Literal["cpu", "gpu"]:
+    """Choose where the program runs, before JAX is used for the first time.
+
+    Raises:
+        ConfigError: a GPU is asked for and JAX has none.
+    """
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    backend = jax.default_backend()
+    if device == "gpu" and backend != "gpu":
+        raise ConfigError(
+            "--device gpu: JAX has no GPU here; install its plugin with: "
+            "pip install 'cref-jax[cuda12]' (driver 525 or newer) or 'cref-jax[cuda13]' (580)"
+        )
+    return "cpu" if backend == "cpu" else "gpu"
+
+
+def train(options: Options, c: Config) -> None:
+    """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
+    run = options.run_dir or runs.ROOT / _name(options)
+    _use_cache()
+    with lock(run):
+        world = runs.world_of(c, options.engine)
+        with runs.checkpoints(run, c.run.keep) as steps:
+            state = _first_state(world, steps, options.resume, run)
+            runs.write_origin(run)
+            first = int(state.train.iteration)
+            samples = c.run.num_envs * c.ppo.horizon
+            with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
+                report.say(_headline(run, c, options, first))
+                state = _loop(world, state, steps, report)
+        _summary(run, world, state)
+
+
+def _loop(
+    world: World, state: learn.RunState, steps: Checkpoints, report: Reporter
+) -> learn.RunState:
+    """Train chunk by chunk; save in between, at the end, and when asked to stop."""
+    c = world.config
+    done = int(state.train.iteration)
+    if done >= c.run.iterations:
+        report.say(f"nothing left to do: {done} of {c.run.iterations} iterations are done")
+        return state
+    report.say("compiling (half a minute on four cores, a few seconds from the cache) ...")
+    begun = time.monotonic()
+    size = min(c.run.chunk, c.run.iterations - done)
+    programs = {size: learn.chunk.lower(world, state, size).compile()}
+    report.say(f"compiled in {time.monotonic() - begun:.0f} s; Ctrl-C saves and stops")
+    stop = cli.StopRequest()
+    saved = time.monotonic()
+    while done < c.run.iterations and not stop.asked:
+        size = min(c.run.chunk, c.run.iterations - done)
+        if size not in programs:
+            programs[size] = learn.chunk.lower(world, state, size).compile()
+        begun = time.monotonic()
+        state, log = programs[size](world, state)
+        log = {name: np.asarray(values) for name, values in log.items()}
+        report.chunk(done, log, time.monotonic() - begun)
+        _check_health(log, c.run.num_envs * c.ppo.horizon)
+        done += size
+        if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
+            _save(steps, state, done)
+            saved = time.monotonic()
+    _save(steps, state, done)
+    if stop.asked:
+        report.say(f"stopped and saved at iteration {done}")
+    return state
+
+
+def _first_state(world: World, steps: Checkpoints, resume: bool, run: Path) -> learn.RunState:
+    """Return the state to begin with: fresh, or that of the newest checkpoint."""
+    if resume and steps.latest() is None:
+        raise ConfigError(f"{run} has no checkpoint to resume; leave --resume out")
+    if not resume and steps.latest() is not None:
+        raise ConfigError(f"{run} holds a run already; add --resume, or choose another --run-dir")
+    runs.write_config(run, world.config)
+    state = jax.jit(learn.initial_state)(world)
+    if not resume:
+        return state
+    stored = steps.meta()["num_envs"]
+    if stored == world.config.run.num_envs:
+        return steps.restore(state)[0]
+    print(f"the number of robots changes from {stored} to {world.config.run.num_envs}: what was")
+    print("learned is kept, the robots start anew, and the run is no longer the same bit for bit")
+    return steps.restore(state, parts=("train",))[0]
+
+
+def _save(steps: Checkpoints, state: learn.RunState, done: int) -> None:
+    robots = state.robots.begins.shape[0]
+    steps.save(done, state, {"num_envs": robots})
+
+
+def _check_health(log: Mapping[str, np.ndarray], samples: int) -> None:
+    """Stop before a broken simulation or update is saved.
+
+    Raises:
+        TrainingError: too many robots blew up, or no gradient was finite.
+    """
+    unstable = float(log["episode/unstable"].max()) / samples
+    if unstable > MAX_UNSTABLE:
+        raise cli.TrainingError(
+            f"the physics blew up in {unstable:.1%} of the samples; the last checkpoint is good"
+        )
+    if float(log["loss/skipped"].min()) == 1.0:
+        raise cli.TrainingError("no gradient was finite; the last checkpoint is good")
+
+
+def _headline(run: Path, c: Config, options: Options, first: int) -> str:
+    engine = resolve_engine(options.engine)
+    device = jax.devices()[0].device_kind
+    start = f", from iteration {first}" if first else ""
+    return (
+        f"{run}: {c.terrain.name} with {c.run.num_envs} robots, engine {engine}, on {device}; "
+        f"iterations {c.run.iterations}{start}"
+    )
+
+
+def _summary(run: Path, world: World, state: learn.RunState) -> None:
+    """Say what was learned and what to type next."""
+    result = evaluation.walk(world.config, world.physics, state.train)
+    print(f"on flat ground: {result.line()}")
+    print(f'saved in {run}; next: make play ARGS="--run {run}"')
+
+
+def _with_short_options(c: Config, options: Options) -> Config:
+    """Return the settings with --num-envs, --iterations and --seed written in."""
+    short = {name: getattr(options, name) for name in ("num_envs", "iterations", "seed")}
+    given = {name: value for name, value in short.items() if value is not None}
+    return dataclasses.replace(c, run=dataclasses.replace(c.run, **given))
+
+
+def _experiment(name: str) -> Path:
+    """Return the file of an experiment, given by its name or as a path."""
+    if name.endswith(".toml"):
+        return Path(name)
+    folder = runs.data_folder("experiments")
+    known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "presets")
+    if name not in (*known, "presets"):
+        raise ConfigError(config.unknown("experiment", name, known))
+    return folder / f"{name}.toml"
+
+
+def _name(options: Options) -> str:
+    """Return the name of a new run."""
+    parts = [Path(options.terrain).stem, *([options.experiment] if options.experiment else [])]
+    return "-".join([*parts, datetime.datetime.now().strftime("%Y%m%d-%H%M%S")])
+
+
+def _use_cache() -> None:
+    """Keep compiled programs in the user's own cache, which holds code and so is private."""
+    folder = Path.home() / ".cache" / "cref_jax" / "xla"
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""What all robots share: the configuration, the physics, the lanes and a bank of first states."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from cref_jax import lanes, terrain
+from cref_jax.config import Config
+from cref_jax.lanes import Atlas
+from cref_jax.physics import Body, Physics
+
+
+@flax.struct.dataclass
+class World:
+    """What all robots share. The arrays travel as arguments, so no program has them built in."""
+
+    config: Config = flax.struct.field(pytree_node=False)
+    physics: Physics = flax.struct.field(pytree_node=False)
+    lanes: Atlas
+    bank: Body  # settled states to start from, a leading axis of their number
+
+
+def make_world(c: Config, physics: Physics) -> World:
+    """Build the terrain and settle the robots that episodes start from.
+
+    Raises:
+        ConfigError: the terrain is unknown or its numbers cannot be used.
+    """
+    return World(c, physics, lanes.build(c.terrain), _settled(c, physics))
+
+
+def _settled(c: Config, physics: Physics) -> Body:
+    """Return `bank_size` states that have stood on flat ground for `settle_time`."""
+    flat = terrain.from_heights(jnp.zeros((1, 1)), c.terrain.cell, (0.0, 0.0))
+    robot, nominal = physics.robot, physics.nominal_dynamics()
+    steps = round(c.episode.settle_time / c.physics.control_period)
+    target = jnp.asarray(robot.nominal_pose)
+
+    def settle(key: PRNGKeyArray) -> Body:
+        joints = target + 0.05 * jax.random.uniform(key, target.shape, minval=-1.0)  # rad
+        base = jnp.array([0.0, 0.0, robot.standing_height, 1.0, 0.0, 0.0, 0.0])
+        still = jnp.zeros(6 + len(target))
+        body = Body(jnp.concatenate([base, joints]), still, still)
+        hold = lambda body, _: (
+            physics.step(flat, body, jnp.stack([target, target]), jnp.int32(0), nominal)[0],
+            None,
+        )
+        return jax.lax.scan(hold, body, None, length=steps)[0]
+
+    keys = jax.random.split(jax.random.key(c.terrain.seed), c.episode.bank_size)
+    return jax.jit(jax.vmap(settle))(keys)

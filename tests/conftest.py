@@ -1,0 +1,26 @@
+"""What every test runs under: the CPU, no display, and a cache of compiled code."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+# Before the first import of jax or mujoco: both read these once.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+import jax
+import pytest
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Most of the suite's time is compilation. The cache is the user's own: it holds machine code.
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cref_jax" / "tests"
+    try:
+        cache.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError:
+        cache = Path(tempfile.mkdtemp(prefix="cref_jax-"))
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

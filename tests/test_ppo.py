@@ -1,0 +1,433 @@
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.training.agents.ppo.losses import compute_gae
+from jax.test_util import check_grads
+
+from cref_jax import config, network, ppo
+
+T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
+C = config.PPO(epochs=2, minibatches=2)
+SMALL = config.Network(token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
+NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
+
+
+def column(*values):
+    return jnp.array(values)[:, None]
+
+
+def initial_params(seed=0):
+    carry, no = network.initial_carry(SMALL, 1), jnp.zeros((1, 1), bool)
+    key_actor, key_critic = jax.random.split(jax.random.key(seed))
+    params = ppo.Params(
+        network.Actor(SMALL, J).init(key_actor, carry, jnp.zeros((1, 1, OBS)), no),
+        network.Critic(SMALL).init(key_critic, jnp.zeros((1, 1, CRITIC_OBS))),
+    )
+    # larger last layers, so that a step changes something that float32 can see
+    return jax.tree.map(lambda p: 1.5 * p, params)
+
+
+def some_rollout(seed=1, params=None):
+    """A rollout of random numbers, its distribution and values from the policy itself."""
+    params = initial_params() if params is None else params
+    keys = iter(jax.random.split(jax.random.key(seed), 12))
+    normal = lambda *shape: jax.random.normal(next(keys), shape)
+    obs, critic_obs = normal(T, E, OBS), normal(T, E, CRITIC_OBS)
+    begins = jax.random.bernoulli(next(keys), 0.2, (T, E))
+    carry = jax.tree.map(lambda m: normal(*m.shape), network.initial_carry(SMALL, E))
+    _, policy = NETWORKS.actor(params.actor, carry, obs, begins)
+    value = NETWORKS.critic(params.critic, critic_obs)
+    return ppo.Rollout(
+        obs=obs,
+        critic_obs=critic_obs,
+        velocity=normal(T, E, 3),
+        action=policy.mean + jnp.exp(policy.log_std) * normal(T, E, J),
+        mean=policy.mean,
+        log_std=jnp.broadcast_to(policy.log_std, policy.mean.shape),
+        reward=normal(T, E),
+        value=value,
+        next_value=normal(T, E),
+        terminated=jax.random.bernoulli(next(keys), 0.2, (T, E)),
+        truncated=jnp.zeros((T, E), bool),
+        begins=begins,
+        valid=jnp.ones((T, E), bool),
+        carry=carry,
+    )
+
+
+def initial_state(params=None, c=C):
+    params = initial_params() if params is None else params
+    return ppo.initial_state(params, OBS, CRITIC_OBS, c)
+
+
+@jax.jit
+def update(state, rollout, key):
+    return ppo.update(state, rollout, key, C, NETWORKS)
+
+
+def assert_same(a, b, **tolerance):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+def test_gae_worked_by_hand():
+    # rewards 1,2,3; values .5,1,1.5; bootstrap 2; gamma .5, lambda .5; no episode ends
+    # d2 = 3+1-1.5 = 2.5 ; d1 = 2+.75-1 = 1.75 ; d0 = 1+.5-.5 = 1
+    # A2 = 2.5 ; A1 = 1.75+.25*2.5 = 2.375 ; A0 = 1+.25*2.375 = 1.59375
+    never = jnp.zeros((3, 1), bool)
+    reward, value, following = column(1.0, 2.0, 3.0), column(0.5, 1.0, 1.5), column(1.0, 1.5, 2.0)
+    advantage = ppo.gae(reward, value, following, never, never, 0.5, 0.5)
+    np.testing.assert_allclose(advantage[:, 0], [1.59375, 2.375, 2.5])
+
+
+def test_falling_cuts_the_bootstrap_and_timeout_does_not():
+    # As above, but the episode ends with step 1, in a state worth 4; gamma .5, lambda .5.
+    # Fallen: d1 = 2-1 = 1 ;     A1 = 1 ; A0 = 1+.25*1 = 1.25
+    # Timeout: d1 = 2+.5*4-1 = 3 ; A1 = 3 ; A0 = 1+.25*3 = 1.75
+    # A2 belongs to the next episode and stays 2.5.
+    never, then = jnp.zeros((3, 1), bool), column(False, True, False)
+    reward, value, following = column(1.0, 2.0, 3.0), column(0.5, 1.0, 1.5), column(1.0, 4.0, 2.0)
+    fallen = ppo.gae(reward, value, following, then, never, 0.5, 0.5)
+    timeout = ppo.gae(reward, value, following, never, then, 0.5, 0.5)
+    np.testing.assert_allclose(fallen[:, 0], [1.25, 1.0, 2.5])
+    np.testing.assert_allclose(timeout[:, 0], [1.75, 3.0, 2.5])
+
+
+def test_gae_agrees_with_brax_where_nothing_is_truncated():
+    r = some_rollout()
+    # brax reads the next value from the next row
+    following = jnp.concatenate([r.value[1:], r.next_value[-1:]])
+    ours = ppo.gae(r.reward, r.value, following, r.terminated, r.truncated, 0.9, 0.8)
+    zero = jnp.zeros((T, E))
+    ends = r.terminated.astype(float)
+    targets, _ = compute_gae(zero, ends, r.reward, r.value, following[-1], 0.8, 0.9)
+    np.testing.assert_allclose(ours, targets - r.value, atol=1e-5)
+
+
+def test_gae_agrees_with_brax_around_a_truncation():
+    # brax gives a truncated step no advantage at all and cuts the trace there; ours lets the step
+    # bootstrap. With a reward of V(s) - gamma V(s') in that step the two must agree.
+    r = some_rollout()
+    truncated = jnp.zeros((T, E), bool).at[2].set(True)
+    following = jnp.concatenate([r.value[1:], r.next_value[-1:]])
+    reward = r.reward.at[2].set(r.value[2] - 0.9 * following[2])
+    never = jnp.zeros((T, E), bool)
+    ours = ppo.gae(reward, r.value, following, never, truncated, 0.9, 0.8)
+    cut, zero = truncated.astype(float), jnp.zeros((T, E))
+    targets, _ = compute_gae(cut, zero, reward, r.value, following[-1], 0.8, 0.9)
+    np.testing.assert_allclose(ours, targets - r.value, atol=1e-5)
+
+
+def test_surrogate_worked_by_hand():
+    # clip .2. Gain: A = 2: r 1.5 -> 1.2*2 = 2.4 ; r .5 -> .5*2 = 1 ; r 1.1 -> 2.2
+    # Loss: A = -2: r 1.5 -> min(-3, -2.4) = -3 ; r .5 -> min(-1, -1.6) = -1.6 ; r 1.1 -> -2.2
+    ratio = jnp.array([[1.5, 0.5, 1.1, 1.5, 0.5, 1.1]])
+    advantage = jnp.array([[2.0, 2.0, 2.0, -2.0, -2.0, -2.0]])
+    out = ppo.surrogate(ratio, advantage, 0.2)
+    np.testing.assert_allclose(out[0], [-2.4, -1.0, -2.2, 3.0, 1.6, 2.2], rtol=1e-6)
+    slope = jax.grad(lambda r: ppo.surrogate(r, advantage, 0.2).sum())(ratio)
+    np.testing.assert_allclose(slope[0], [0.0, -2.0, -2.0, 2.0, 0.0, 2.0])
+
+
+def test_value_error_worked_by_hand():
+    # old 1, clip .2. V 1.1, target 2: (.9)^2 = .81, inside the clip range
+    # V 2, target 2: free 0, held 1.2: .64 ; V 3, target 1: free 4, held 1.2: .04
+    value, target = jnp.array([[1.1, 2.0, 3.0]]), jnp.array([[2.0, 2.0, 1.0]])
+    out = ppo.value_error(value, jnp.ones((1, 3)), target, 0.2)
+    np.testing.assert_allclose(out[0], [0.81, 0.64, 4.0], rtol=1e-5)
+
+
+def test_log_prob_and_entropy_worked_by_hand():
+    # x = (1, 0), m = (0, 0), s = (1, 2): -(1/2 + ln 1 + .918939) - (0 + ln 2 + .918939) = -3.031024
+    # entropy: ln 1 + ln 2 + 2 * 1.418939 = 3.531024
+    mean, log_std = jnp.zeros((1, 2)), jnp.log(jnp.array([1.0, 2.0]))
+    out = ppo.log_prob(jnp.array([[1.0, 0.0]]), mean, log_std)
+    np.testing.assert_allclose(out, [-3.031024], rtol=1e-6)
+    np.testing.assert_allclose(ppo.entropy(log_std), 3.531024, rtol=1e-6)
+
+
+def test_kl_worked_by_hand():
+    # old (0, s 1), new (1, s 2): ln 2 + (1 + 1)/8 - 1/2 = .443147
+    # old (1, s 2), new (1, s 2): 0.  The divergence of the pair is their sum.
+    old_mean, old_log_std = jnp.array([[0.0, 1.0]]), jnp.log(jnp.array([[1.0, 2.0]]))
+    out = ppo.kl(old_mean, old_log_std, jnp.ones((1, 2)), jnp.log(jnp.array([2.0, 2.0])))
+    np.testing.assert_allclose(out, [0.443147], rtol=1e-5)
+
+
+def test_kl_and_entropy_agree_with_sampling():
+    mean, log_std = jnp.array([0.3, -1.0]), jnp.array([-0.5, 0.4])
+    other, other_log_std = jnp.array([0.0, -0.5]), jnp.array([-0.2, 0.1])
+    x = mean + jnp.exp(log_std) * jax.random.normal(jax.random.key(0), (200_000, 2))
+    p = ppo.log_prob(x, jnp.broadcast_to(mean, x.shape), log_std)
+    q = ppo.log_prob(x, jnp.broadcast_to(other, x.shape), other_log_std)
+    exact = ppo.kl(mean[None], log_std[None], other[None], other_log_std)[0]
+    np.testing.assert_allclose(jnp.mean(p - q), exact, atol=0.01)
+    np.testing.assert_allclose(-jnp.mean(p), ppo.entropy(log_std), atol=0.01)
+
+
+class OneStep(NamedTuple):
+    mean: jax.Array
+    log_std: jax.Array
+    velocity: jax.Array
+
+
+def test_the_loss_worked_by_hand():
+    # One sample, one action. Behaviour N(0, 1), now N(m, 1) with m = .1, action 1:
+    # log ratio = (1 - .81)/2 = .095, ratio 1.099659, advantage 2 -> surrogate -2.199318
+    # V = 1.1, old 1, return 2: .81.  velocity (1, 2, 0) against 0: 5.  entropy 1.418939
+    # KL = .01/2 = .005
+    # total = -2.199318 + 1*.81 + 1*5 - .005*1.418939 = 3.603588
+    one = lambda x: jnp.full((1, 1), x)
+    batch = ppo.Batch(
+        obs=jnp.zeros((1, 1, 1)),
+        critic_obs=jnp.zeros((1, 1, 1)),
+        velocity=jnp.zeros((1, 1, 3)),
+        action=jnp.ones((1, 1, 1)),
+        mean=jnp.zeros((1, 1, 1)),
+        log_std=jnp.zeros((1, 1, 1)),
+        value=one(1.0),
+        advantage=one(2.0),
+        returns=one(2.0),
+        begins=one(False),
+        valid=one(True),
+        carry=(),
+    )
+    said = lambda m: OneStep(m[None, None, None], jnp.zeros(1), jnp.array([[[1.0, 2.0, 0.0]]]))
+    networks = ppo.Networks(lambda m, carry, obs, begins: (carry, said(m)), lambda v, s: one(v))
+    params = ppo.Params(jnp.array(0.1), jnp.array(1.1))
+    total, parts = ppo.loss(params, batch, config.PPO(), networks)
+    np.testing.assert_allclose(total, 3.603588, rtol=1e-6)
+    expected = {
+        "surrogate": -2.199318,
+        "value": 0.81,
+        "velocity": 5.0,
+        "entropy": 1.418939,
+        "kl": 0.005,
+        "clipped": 0.0,
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(parts, name), value, rtol=1e-5, err_msg=name)
+
+
+def test_the_gradient_of_the_loss_agrees_with_finite_differences():
+    with jax.enable_x64(True):
+        wide = lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x
+        params = jax.tree.map(wide, initial_params())
+        rollout = jax.tree.map(wide, some_rollout())
+        statistics = initial_state().statistics
+        batch = jax.tree.map(wide, ppo.judge(statistics, rollout, C))
+        # the estimator trains on its own loss alone, so the actor is checked without it
+        actor = params.actor["params"]
+
+        def loss(rest, critic):
+            rest, critic = jax.tree.map(jnp.asarray, (rest, critic))
+            moved = ppo.Params({"params": {**actor, **rest}}, critic)
+            return ppo.loss(moved, batch, C, NETWORKS)[0]
+
+        rest = {k: 1.01 * v for k, v in actor.items() if k == "log_std"} | {
+            k: v for k, v in actor.items() if k not in ("velocity_estimator", "log_std")
+        }
+        check_grads(loss, (rest, params.critic), order=1, modes=["rev"], rtol=1e-5)
+
+
+def test_ratio_and_kl_of_the_first_minibatch_say_that_nothing_has_moved():
+    _, losses = update(initial_state(), some_rollout(), jax.random.key(0))
+    assert losses.kl.shape == (C.epochs, C.minibatches)
+    np.testing.assert_allclose(losses.kl[0, 0], 0.0, atol=1e-6)
+    assert losses.kl[-1, -1] > 1e-5
+
+
+def test_advantages_are_normalised_over_the_whole_batch():
+    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    np.testing.assert_allclose(batch.advantage.mean(), 0.0, atol=1e-6)
+    np.testing.assert_allclose(batch.advantage.std(), 1.0, rtol=1e-5)
+    assert abs(float(batch.advantage[:, 0].mean())) > 1e-3
+
+
+def test_minibatches_never_mix_time_or_environments():
+    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    mark = jnp.arange(T)[:, None] + 100.0 * jnp.arange(E)[None]
+    batch = batch._replace(
+        value=mark,
+        obs=jnp.repeat(mark[..., None], OBS, axis=-1),
+        carry=jax.tree.map(
+            lambda m: jnp.broadcast_to(100.0 * jnp.arange(E)[:, None], m.shape), batch.carry
+        ),
+    )
+    split = ppo.minibatches(batch, jax.random.key(0), 2)
+    assert split.value.shape == (2, T, E // 2)
+    # each column is one environment through all of time
+    step, env = split.value % 100, split.value // 100
+    assert np.all(step == np.arange(T)[None, :, None])
+    assert np.all(env == env[:, :1])
+    # every environment comes exactly once, and all records keep together
+    assert sorted(split.value[:, 0].ravel()) == list(100.0 * np.arange(E))
+    np.testing.assert_array_equal(split.obs[..., 0], split.value)
+    np.testing.assert_array_equal(split.carry.gru[..., 0], split.value[:, 0])
+
+
+def test_minibatches_differ_from_epoch_to_epoch_and_refuse_a_remainder():
+    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    a, b = (ppo.minibatches(batch, jax.random.key(seed), 2).value for seed in (0, 1))
+    assert np.any(a != b)
+    with pytest.raises(ValueError, match="8 environments do not split into 3"):
+        ppo.minibatches(batch, jax.random.key(0), 3)
+
+
+def test_invalid_samples_change_nothing():
+    # Two rollouts that differ only in two broken steps must teach exactly the same.
+    broken = jnp.zeros((T, E), bool).at[2, 3].set(True).at[T - 1, 5].set(True)
+    sound = some_rollout()
+    begins = sound.begins | jnp.roll(broken, 1, axis=0).at[0].set(False)
+    sound = sound._replace(valid=~broken, begins=begins)
+
+    def ruin(x):
+        if x.dtype == bool:
+            return x
+        return jnp.where(broken.reshape(T, E, *[1] * (x.ndim - 2)), jnp.nan, x)
+
+    ruined = jax.tree.map(ruin, sound._replace(carry=()))._replace(carry=sound.carry)
+    assert not np.isfinite(ruined.obs).all()
+    state = initial_state()
+    after_sound, losses_sound = update(state, sound, jax.random.key(0))
+    after_ruined, losses_ruined = update(state, ruined, jax.random.key(0))
+    assert_same((after_sound, losses_sound), (after_ruined, losses_ruined), rtol=0.0)
+    assert np.isfinite(losses_ruined.gradient_norm).all() and not losses_ruined.skipped.any()
+
+
+def test_an_invalid_step_ends_the_horizon_of_those_before_it():
+    sound = some_rollout()._replace(terminated=jnp.zeros((T, E), bool))
+    broken = sound._replace(valid=sound.valid.at[3].set(False))
+    first = jax.tree.map(lambda x: x[:3], sound._replace(carry=()))._replace(carry=sound.carry)
+    statistics = initial_state().statistics
+    # returns, since advantages are normalised over other samples
+    whole, part = ppo.judge(statistics, broken, C), ppo.judge(statistics, first, C)
+    np.testing.assert_allclose(whole.returns[:3], part.returns, atol=1e-6)
+
+
+def test_a_rollout_without_a_valid_sample_leaves_finite_numbers():
+    nothing = some_rollout()._replace(valid=jnp.zeros((T, E), bool))
+    state, losses = update(initial_state(), nothing, jax.random.key(0))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves((state, losses)))
+
+
+def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
+    state = initial_state()
+    bad = jax.tree.map(lambda p: jnp.full_like(p, jnp.nan), state.params)
+    bad = state.params._replace(critic=bad.critic)
+    opt = ppo.optimiser(C)
+    changes, after = opt.update(bad, state.opt_state, state.params)
+    assert not any(np.any(x) for x in jax.tree.leaves(changes))
+    assert int(after.total_notfinite) == 1 and int(after.notfinite_count) == 1
+    assert_same(after.inner_state, state.opt_state.inner_state)
+
+
+def test_an_update_of_bad_gradients_changes_no_parameter():
+    # a valid sample whose reward overflows the value loss
+    rollout = some_rollout()._replace(reward=jnp.full((T, E), 3e38))
+    state, losses = update(initial_state(), rollout, jax.random.key(0))
+    assert losses.skipped.all()
+    assert int(state.opt_state.total_notfinite) == C.epochs * C.minibatches
+    assert int(state.opt_state.notfinite_count) == C.epochs * C.minibatches
+    assert_same(state.params, initial_params())
+
+
+@pytest.mark.parametrize(
+    ("rate", "kl", "expected"),
+    [
+        (1e-3, 0.021, 1e-3 / 1.5),  # above 2 x 0.01
+        (1e-3, 0.020, 1e-3),
+        (1e-3, 0.010, 1e-3),
+        (1e-3, 0.005, 1e-3),
+        (1e-3, 0.004, 1.5e-3),  # below 0.01 / 2
+        (1e-3, 0.0, 1e-3),  # nothing has moved
+        (1e-3, math.nan, 1e-3),
+        (1e-5, 0.1, 1e-5),  # the ends of the range
+        (9e-3, 0.001, 1e-2),
+    ],
+)
+def test_learning_rate_adaptation_worked_by_hand(rate, kl, expected):
+    out = ppo.adapt(jnp.array(rate), jnp.array(kl), config.PPO())
+    np.testing.assert_allclose(out, expected, rtol=1e-6)
+
+
+def test_the_learning_rate_is_part_of_the_state_and_goes_on_from_there():
+    state, losses = update(initial_state(), some_rollout(), jax.random.key(0))
+    rates = losses.learning_rate.ravel()
+    kls = losses.kl.ravel()
+    rate = C.learning_rate
+    for i in range(rates.size):
+        rate = float(ppo.adapt(jnp.array(rate), kls[i], C))
+        np.testing.assert_allclose(rates[i], rate, rtol=1e-5)
+    assert rate != C.learning_rate
+    _, again = update(state, some_rollout(), jax.random.key(1))
+    held = float(ppo.adapt(rates[-1], again.kl[0, 0], C))
+    np.testing.assert_allclose(again.learning_rate[0, 0], held, rtol=1e-6)
+
+
+def test_the_learning_rate_scales_the_step():
+    # Adam's first step is the rate times the sign of each gradient
+    one = config.PPO(epochs=1, minibatches=1, learning_rate=1e-4)
+    state = initial_state(c=one)
+    after, losses = ppo.update(state, some_rollout(), jax.random.key(0), one, NETWORKS)
+    moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, state.params)
+    largest = max(float(m) for m in jax.tree.leaves(moved))
+    np.testing.assert_allclose(largest, losses.learning_rate[0, 0], rtol=1e-2)
+
+
+def test_statistics_are_those_of_all_valid_samples():
+    valid = jax.random.bernoulli(jax.random.key(5), 0.7, (T, E))
+    first, second = some_rollout(1)._replace(valid=valid), some_rollout(2)
+    state, _ = update(initial_state(), first, jax.random.key(0))
+    state, _ = update(state, second, jax.random.key(0))
+    seen = np.concatenate([first.obs[valid], second.obs.reshape(-1, OBS)])
+    np.testing.assert_allclose(state.statistics.obs.mean, seen.mean(0), atol=1e-5)
+    np.testing.assert_allclose(state.statistics.obs.std, np.sqrt(seen.var(0) + 1e-4), rtol=1e-4)
+    assert int(state.iteration) == 2
+
+
+def test_normalisation_is_bounded_and_undoes_scale():
+    statistics = initial_state().statistics.obs
+    x = 5.0 + 2.0 * jax.random.normal(jax.random.key(0), (400, 50, OBS))
+    statistics = ppo.observe(statistics, x, jnp.ones((400, 50), bool))
+    out = ppo.normalise(statistics, x)
+    np.testing.assert_allclose(out.mean((0, 1)), 0.0, atol=1e-3)
+    np.testing.assert_allclose(out.std((0, 1)), 1.0, rtol=1e-3)
+    assert float(ppo.normalise(statistics, jnp.full((1, OBS), 1e9)).max()) == ppo.OBSERVATION_CLIP
+
+
+def test_an_update_runs_inside_a_scan():
+    def iteration(state, key):
+        return ppo.update(state, some_rollout(), key, C, NETWORKS)
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    state, losses = jax.jit(lambda s: jax.lax.scan(iteration, s, keys))(initial_state())
+    assert int(state.iteration) == 3
+    assert losses.kl.shape == (3, C.epochs, C.minibatches)
+
+    one_by_one = initial_state()
+    for key in keys:
+        one_by_one, _ = update(one_by_one, some_rollout(), key)
+    assert_same(one_by_one.params, state.params, atol=1e-5)
+
+
+def test_an_update_compiles_once():
+    # a weak type or another dtype in the state that comes out would compile everything again
+    learn = jax.jit(lambda state, key: ppo.update(state, some_rollout(), key, C, NETWORKS)[0])
+    state = learn(initial_state(), jax.random.key(0))
+    learn(state, jax.random.key(1))
+    assert learn._cache_size() == 1
+
+
+def test_the_shape_of_a_state_can_be_asked_for_without_one():
+    shape = jax.eval_shape(initial_state)
+    assert jax.tree.structure(shape) == jax.tree.structure(initial_state())
+
+    seeds = jax.vmap(lambda state: state.replace(iteration=state.iteration + 1))(
+        jax.tree.map(lambda x: jnp.stack([x, x]), initial_state())
+    )
+    assert seeds.iteration.tolist() == [1, 1]
