@@ -5,7 +5,10 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
+
+import jax
 
 from cref_jax.checkpoint import CheckpointError
 from cref_jax.config import ConfigError
@@ -33,13 +36,32 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         sys.exit(130)
 
 
+def use_compile_cache() -> None:
+    """Keep compiled programs in the user's own cache; it holds code, and so is private."""
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = home / "cref_jax" / "xla"
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError:
+        return  # a read-only home costs time, nothing else
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
 class StopRequest:
     """Notes the first Ctrl-C or SIGTERM, so that the work can be saved; the second ends at once."""
 
     def __init__(self) -> None:
         self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._ask)
+
+    def __enter__(self) -> "StopRequest":
+        signals = (signal.SIGINT, signal.SIGTERM)
+        self._before = {number: signal.signal(number, self._ask) for number in signals}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         if self.asked:

@@ -3,13 +3,13 @@
 Coordinates are the lane's own: x along it from its start, y across, z = 0 at the start.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from cref_jax import config, geometry
 from cref_jax.host_physics import Dynamics
@@ -18,6 +18,7 @@ from cref_jax.physics import Body
 from cref_jax.world import World
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class EnvState:
     """One robot between two control steps."""
@@ -55,12 +56,12 @@ class Ending(NamedTuple):
     timeout: Bool[Array, ""]
 
     @property
-    def terminated(self) -> Bool[Array, ""]:
+    def terminated(self) -> Bool[ArrayLike, "..."]:
         """The robot has failed: no value follows."""
         return self.tilted | self.low | self.hit | self.dropped | self.unstable
 
     @property
-    def truncated(self) -> Bool[Array, ""]:
+    def truncated(self) -> Bool[ArrayLike, "..."]:
         """The episode was cut although the robot could have gone on."""
         return (self.finished | self.timeout) & ~self.terminated
 
@@ -146,7 +147,7 @@ def ending(world: World, state: EnvState, links: Links, unstable: Bool[Array, ""
         hit=world.physics.is_hit(world.lanes.tile(state.level, state.kind), links),
         dropped=foot_z.min() < state.support_z - c.episode.below_edge,
         unstable=unstable,
-        finished=has_end & (state.body.qpos[0] > world.lanes.length - c.episode.lane_end),
+        finished=has_end & (state.body.qpos[0] > world.lanes.end - c.episode.lane_end),
         timeout=state.step >= round(c.episode.length / c.physics.control_period),
     )
 

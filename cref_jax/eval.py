@@ -35,6 +35,7 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
+        cli.use_compile_cache()
         run = options.run or runs.newest()
         world = runs.world_of(runs.read_config(run), options.engine)
         policy = runs.load_policy(run, world)

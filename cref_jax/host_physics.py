@@ -7,6 +7,7 @@ environment means the same alone as in a batch.
 
 import functools
 import os
+import threading
 from typing import NamedTuple
 
 import jax
@@ -44,6 +45,7 @@ class HostEngine:
         self._trunk = trunk
         self._threads = threads or os.cpu_count() or 1
         self._batch = functools.lru_cache(maxsize=4)(self._make_batch)
+        self._lock = threading.Lock()  # several devices may call at once, for the same simulations
 
     def _make_batch(self, count: int) -> "_Simulations":
         return _Simulations(self._model, self._trunk, count, min(self._threads, count))
@@ -75,7 +77,8 @@ class HostEngine:
         count = int(np.prod(lead, dtype=int))
         flat = [x.reshape(count, *x.shape[len(lead) :]) for x in arrays]
         varied = Dynamics(*(np.asarray(x).reshape(count, *x.shape[len(lead) :]) for x in dynamics))
-        result = self._batch(count).step(flat, varied)
+        with self._lock:
+            result = self._batch(count).step(flat, varied)
         return Substep(*(x.reshape(*lead, *x.shape[1:]) for x in result))
 
 

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, no_type_check
 
 import flax.struct
 import numpy as np
@@ -26,6 +26,7 @@ MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: w
 MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Atlas:
     """All lanes in one grid: rows are levels, columns are kinds."""
@@ -44,6 +45,11 @@ class Atlas:
     def length(self) -> float:
         """Length of a lane, m."""
         return self.columns[0] * self.terrain.cell
+
+    @property
+    def end(self) -> Float[ArrayLike, ""]:
+        """Where a lane ends, m along it."""
+        return self.terrain.origin[0] + self.length
 
     def tile(self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""]) -> Terrain:
         """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""

@@ -5,6 +5,7 @@ number of the iteration, so neither the length of a chunk nor a resumption chang
 """
 
 import functools
+from typing import no_type_check
 
 import flax.struct
 import jax
@@ -17,6 +18,7 @@ from cref_jax.world import World
 Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class RunState:
     """Everything that a run carries from one iteration to the next."""

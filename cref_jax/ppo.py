@@ -5,19 +5,25 @@ is never split: a minibatch is some environments over the whole horizon, from th
 Samples that are not `valid` count in no loss and in no statistic, whatever they hold.
 """
 
+import contextlib
+import io
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, no_type_check
 
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
-from brax.training.acme.running_statistics import RunningStatisticsState
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from cref_jax import config
+
+with contextlib.redirect_stdout(
+    io.StringIO()
+):  # brax loads MJX, which reports that warp is missing
+    from brax.training.acme import running_statistics
+    from brax.training.acme.running_statistics import RunningStatisticsState
 
 OBSERVATION_CLIP = 10.0  # standard deviations; assumed: what lies beyond says nothing more
 _VARIANCE_FLOOR = 1e-4  # added to each input's variance; assumed: a constant input stays near 0
@@ -57,6 +63,7 @@ class Statistics(NamedTuple):
     critic_obs: RunningStatisticsState
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @struct.dataclass
 class TrainState:
     """Everything that learning carries from one iteration to the next."""

@@ -3,7 +3,7 @@
 Training and evaluation share it. The robots' axis is E, and every record is [T, E, ...].
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import flax.struct
 import jax
@@ -17,6 +17,7 @@ from cref_jax.observation import Observation
 from cref_jax.world import World
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Robots:
     """E robots between two control steps, with what their policy remembers."""
@@ -25,6 +26,17 @@ class Robots:
     observation: Observation
     memory: network.Carry
     begins: Bool[Array, " E"]  # the next step is the first of an episode
+
+
+class _Step(NamedTuple):
+    """What a horizon is made of, one control step of it."""
+
+    observation: Observation  # that the action was taken on
+    begins: Bool[Array, " E"]
+    action: Float[Array, "E J"]
+    mean: Float[Array, "E J"]
+    log_std: Float[Array, "E J"]
+    outcome: Outcome
 
 
 class Trace(NamedTuple):
@@ -98,35 +110,33 @@ def collect(
 ) -> tuple[Robots, ppo.Rollout, Trace]:
     """Return a horizon of experience, with actions drawn from the policy."""
 
-    def step(
-        robots: Robots, key: PRNGKeyArray
-    ) -> tuple[Robots, tuple[Robots, Float[Array, "E J"], network.Output, Outcome]]:
+    def step(robots: Robots, key: PRNGKeyArray) -> tuple[Robots, _Step]:
         memory, policy = act(nets, train, robots)
         mean = policy.mean[0]
         action = mean + jnp.exp(policy.log_std) * jax.random.normal(key, mean.shape)
         after, outcome = advance(world, robots, memory, action)
-        before = robots.replace(env=None, memory=None)
-        return after, (before, action, policy, outcome)
+        log_std = jnp.broadcast_to(policy.log_std, mean.shape)
+        return after, _Step(robots.observation, robots.begins, action, mean, log_std, outcome)
 
     keys = jax.random.split(key, world.config.ppo.horizon)
-    after, (before, action, policy, outcome) = jax.lax.scan(step, robots, keys)
+    after, steps = jax.lax.scan(step, robots, keys)
     value = lambda s: nets.critic(
         train.params.critic, ppo.normalise(train.statistics.critic_obs, s)
     )
-    mean = policy.mean[:, 0]
+    outcome = steps.outcome
     rollout = ppo.Rollout(
-        obs=before.observation.proprioception,
-        critic_obs=before.observation.privileged,
-        velocity=before.observation.velocity,
-        action=action,
-        mean=mean,
-        log_std=jnp.broadcast_to(policy.log_std[:, None], mean.shape),
+        obs=steps.observation.proprioception,
+        critic_obs=steps.observation.privileged,
+        velocity=steps.observation.velocity,
+        action=steps.action,
+        mean=steps.mean,
+        log_std=steps.log_std,
         reward=outcome.reward,
-        value=value(before.observation.privileged),
+        value=value(steps.observation.privileged),
         next_value=value(outcome.last_privileged),
         terminated=outcome.ending.terminated,
         truncated=outcome.ending.truncated,
-        begins=before.begins,
+        begins=steps.begins,
         valid=~outcome.ending.unstable,
         carry=robots.memory,
     )

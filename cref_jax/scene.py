@@ -5,8 +5,6 @@ motion shows: the tone changes with each tread and with each metre. Where too ma
 needed, as on a slope or on noise, a height field is drawn through the columns' middles instead.
 """
 
-import contextlib
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -20,17 +18,17 @@ from cref_jax.terrain import Terrain
 Frame = UInt8[np.ndarray, "height width 3"]
 
 GROUND = 0  # geom group of the lane and of the plain; the robot's shapes are in 2 and 3
-MOST_BOXES = 500  # beyond, a height field; stairs take some 150, a slope 1000
+MOST_BOXES = 150  # beyond, a height field; stairs take some 40, a slope 200 and more
 MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU
 TILE = 1.0  # m, between two changes of tone
 BASE = 0.1  # m, from the plain to the lowest column
 TONES = ((0.80, 0.78, 0.74), (0.66, 0.65, 0.63))  # red, green, blue
-PLAIN = (0.70, 0.74, 0.78)
-SKY = ((0.30, 0.47, 0.68), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
+PLAIN = (0.66, 0.72, 0.78)
+SKY = ((0.30, 0.50, 0.75), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
 
-AZIMUTH = 128.0  # deg, where the camera looks: the robot comes from the left, seen from the front
-ELEVATION = -13.0  # deg
-DISTANCE = 4.2  # m, from the camera to the pelvis
+AZIMUTH = 100.0  # deg, where the camera looks: the robot walks to the right, and nearer a little
+ELEVATION = -14.0  # deg
+DISTANCE = 4.0  # m, from the camera to the pelvis
 VIEW = 32.0  # deg, vertical
 CALM = 1.0  # s of the pelvis's way that the camera averages over
 
@@ -50,7 +48,7 @@ def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) ->
     heights, origin = window(ground)
     _add_light(spec)
     _add_plain(spec, float(heights.min()) - BASE)
-    found = boxes(heights, round(TILE / ground.cell))
+    found = boxes(heights, max(1, round(TILE / ground.cell)))
     if found is None:
         _add_field(spec, heights, origin, ground.cell)
     else:
@@ -71,17 +69,17 @@ def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) 
     Greedy: from the first column that is left, as far as possible across, then along.
     """
     tone = _tones(heights, tile)
-    left = np.ones(heights.shape, bool)
+    number = np.unique(heights, return_inverse=True)[1].reshape(heights.shape)
+    look = 2 * number + tone  # what a box has in common; -1: in a box already
     found: list[tuple[tuple[int, int], tuple[int, int]]] = []
-    while left.any():
+    while (look >= 0).any():
         if len(found) == most:
             return None
-        i, j = np.unravel_index(np.argmax(left), left.shape)
-        same = left & (heights == heights[i, j]) & (tone == tone[i, j])
-        across = _run(same[i, j:])
-        along = _run(same[i:, j : j + across].all(axis=1))
-        left[i : i + along, j : j + across] = False
-        found.append(((int(i), int(j)), (along, across)))
+        i, j = (int(k) for k in np.unravel_index(np.argmax(look >= 0), look.shape))
+        across = _run(look[i, j:] == look[i, j])
+        along = _run((look[i:, j : j + across] == look[i, j]).all(axis=1))
+        look[i : i + along, j : j + across] = -1
+        found.append(((i, j), (along, across)))
     first, size = (np.array(part, np.int32) for part in zip(*found, strict=True))
     at = tuple(first.T)
     return Boxes(first, size, heights[at], tone[at])
@@ -106,15 +104,15 @@ class Canvas:
         except Exception as error:  # each backend raises its own kinds
             raise ConfigError(
                 "cannot draw without OpenGL; on Debian and Ubuntu: "
-                "apt install libegl1 libosmesa6 libgl1"
+                "apt install libegl1 libosmesa6 libgl1; if a display is set but is not there: "
+                "MUJOCO_GL=egl"
             ) from error
 
     def __enter__(self) -> "Canvas":
         return self
 
     def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(Exception):  # some drivers fail here, with the work done
-            self._renderer.close()
+        self._renderer.close()
 
     def draw(self, qpos: Float[np.ndarray, " Q"], look_at: Float[np.ndarray, "3"]) -> Frame:
         """Return the picture of the robot in this pose, the camera turned to a point of space."""
@@ -124,32 +122,29 @@ class Canvas:
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
 
-    def film(self, qpos: Float[np.ndarray, "T Q"], period: float) -> Iterator[Frame]:
-        """Yield the picture of each pose, the camera following the pelvis; `period` in s."""
-        for pose, point in zip(qpos, smoothed(qpos[:, :3], CALM / period), strict=True):
-            yield self.draw(pose, point)
 
+def camera_path(qpos: Float[np.ndarray, "T Q"], period: float) -> Float[np.ndarray, "T 3"]:
+    """Return the points to look at, m: the pelvis's way, averaged over `CALM` around each pose.
 
-def smoothed(path: Float[np.ndarray, "T 3"], width: float) -> Float[np.ndarray, "T 3"]:
-    """Return the path averaged over `width` points around each; its ends are held, not moved."""
-    half = min(round(width / 2), len(path) - 1)
+    `period` lies between two poses, s. At both ends the way goes on as its mirror image through
+    the end point, so that a straight way stays as it is.
+    """
+    path = qpos[:, :3]
+    half = min(round(0.5 * CALM / period), len(path) - 1)
     weights = np.hanning(2 * half + 3)[1:-1]
-    weights /= weights.sum()
-    # reflected through its end points, a straight path stays what it is
-    before = 2 * path[:1] - path[half:0:-1]
-    after = 2 * path[-1:] - path[-2 : -2 - half : -1]
-    padded = np.concatenate([before, path, after])
-    return np.stack([np.convolve(axis, weights, mode="valid") for axis in padded.T], axis=1)
+    before = 2.0 * path[:1] - path[half:0:-1]
+    after = 2.0 * path[-1:] - path[-2 : -2 - half : -1]
+    way = np.concatenate([before, path, after])
+    averaged = [np.convolve(axis, weights / weights.sum(), mode="valid") for axis in way.T]
+    return np.stack(averaged, axis=1)
 
 
 def _tones(heights: Float[np.ndarray, "X Y"], tile: int) -> Int[np.ndarray, "X Y"]:
-    """Return 0 or 1 for each column: a checkerboard that begins anew at each change of height."""
-    x, y = np.arange(heights.shape[0])[:, None], np.arange(heights.shape[1])
-    rises = np.diff(heights, axis=0, prepend=heights[:1]) != 0.0
-    since = x - np.maximum.accumulate(np.where(rises, x, 0), axis=0)
-    # a stretch's number and the tiles in it: the two tones alternate at both kinds of border
-    turns = rises | ((since > 0) & (since % tile == 0))
-    return (np.cumsum(turns, axis=0) + y // tile) % 2
+    """Return 0 or 1 for each column: along x they take turns at each riser and each `tile`."""
+    x = np.arange(heights.shape[0])[:, None]
+    risers = np.diff(heights, axis=0, prepend=heights[:1]) != 0.0
+    since = x - np.maximum.accumulate(np.where(risers, x, 0), axis=0)  # the last riser
+    return np.cumsum(risers | ((since > 0) & (since % tile == 0)), axis=0) % 2
 
 
 def _run(flags: Bool[np.ndarray, " n"]) -> int:
@@ -262,7 +257,8 @@ def _add_light(spec: mujoco.MjSpec) -> None:
     visual.headlight.specular = [0.0, 0.0, 0.0]
     visual.rgba.haze = [*SKY[1], 1.0]
     visual.global_.fovy = VIEW
-    visual.quality.shadowsize = 4096
-    visual.map.shadowclip = 2.0  # of the extent: half the side of the square with shadows
+    visual.quality.shadowsize = 2048
+    visual.map.shadowclip = 1.5  # of the extent: half the side of the square with shadows
+    visual.map.haze = 0.6
     visual.map.zfar = 50.0  # of the extent
     spec.stat.extent = 2.0  # m

@@ -6,7 +6,7 @@ outside of the window the heights of its border continue. Frames: x along the la
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
 import flax.struct
 import jax
@@ -19,6 +19,7 @@ _NEIGHBOURS = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0
 _ABOVE = 1e-5  # m, a second contact lies further than this in front of the first one's plane
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Terrain:
     """A window of a grid of columns."""

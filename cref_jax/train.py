@@ -50,6 +50,8 @@ class Options:
     """go on with the run in --run-dir, or with the newest one"""
     print_config: bool = False
     """print every setting as JSON and stop"""
+    evaluate: bool = True
+    """let the policy walk 100 episodes at the end"""
     tensorboard: bool = True
     """write TensorBoard files, too"""
     debug: bool = False
@@ -133,9 +135,9 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
     run = options.run_dir or runs.ROOT / _name(options)
-    _use_cache()
+    cli.use_compile_cache()
+    world = runs.world_of(c, options.engine)  # refuses a wrong terrain before anything is written
     with lock(run):
-        world = runs.world_of(c, options.engine)
         with runs.checkpoints(run, c.run.keep) as steps:
             state = _first_state(world, steps, options.resume, run)
             runs.write_origin(run)
@@ -144,7 +146,7 @@ def train(options: Options, c: Config) -> None:
             with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
                 report.say(_headline(run, c, options, first))
                 state = _loop(world, state, steps, report)
-        _summary(run, world, state)
+        _summary(run, world, state, options.evaluate)
 
 
 def _loop(
@@ -161,22 +163,22 @@ def _loop(
     size = min(c.run.chunk, c.run.iterations - done)
     programs = {size: learn.chunk.lower(world, state, size).compile()}
     report.say(f"compiled in {time.monotonic() - begun:.0f} s; Ctrl-C saves and stops")
-    stop = cli.StopRequest()
     saved = time.monotonic()
-    while done < c.run.iterations and not stop.asked:
-        size = min(c.run.chunk, c.run.iterations - done)
-        if size not in programs:
-            programs[size] = learn.chunk.lower(world, state, size).compile()
-        begun = time.monotonic()
-        state, log = programs[size](world, state)
-        log = {name: np.asarray(values) for name, values in log.items()}
-        report.chunk(done, log, time.monotonic() - begun)
-        _check_health(log, c.run.num_envs * c.ppo.horizon)
-        done += size
-        if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
-            _save(steps, state, done)
-            saved = time.monotonic()
-    _save(steps, state, done)
+    with cli.StopRequest() as stop:
+        while done < c.run.iterations and not stop.asked:
+            size = min(c.run.chunk, c.run.iterations - done)
+            if size not in programs:
+                programs[size] = learn.chunk.lower(world, state, size).compile()
+            begun = time.monotonic()
+            state, log = programs[size](world, state)
+            log = {name: np.asarray(values) for name, values in log.items()}
+            report.chunk(done, log, time.monotonic() - begun)
+            _check_health(log, c.run.num_envs * c.ppo.horizon)
+            done += size
+            if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
+                _save(steps, state, done)
+                saved = time.monotonic()
+        _save(steps, state, done)
     if stop.asked:
         report.say(f"stopped and saved at iteration {done}")
     return state
@@ -230,10 +232,11 @@ def _headline(run: Path, c: Config, options: Options, first: int) -> str:
     )
 
 
-def _summary(run: Path, world: World, state: learn.RunState) -> None:
+def _summary(run: Path, world: World, state: learn.RunState, evaluate: bool) -> None:
     """Say what was learned and what to type next."""
-    result = evaluation.walk(world.config, world.physics, state.train)
-    print(f"on flat ground: {result.line()}")
+    if evaluate:
+        result = evaluation.walk(world.config, world.physics, state.train)
+        print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')
 
 
@@ -259,14 +262,6 @@ def _name(options: Options) -> str:
     """Return the name of a new run."""
     parts = [Path(options.terrain).stem, *([options.experiment] if options.experiment else [])]
     return "-".join([*parts, datetime.datetime.now().strftime("%Y%m%d-%H%M%S")])
-
-
-def _use_cache() -> None:
-    """Keep compiled programs in the user's own cache, which holds code and so is private."""
-    folder = Path.home() / ".cache" / "cref_jax" / "xla"
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
 if __name__ == "__main__":

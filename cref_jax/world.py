@@ -1,5 +1,7 @@
 """What all robots share: the configuration, the physics, the lanes and a bank of first states."""
 
+from typing import no_type_check
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from cref_jax.lanes import Atlas
 from cref_jax.physics import Body, Physics
 
 
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class World:
     """What all robots share. The arrays travel as arguments, so no program has them built in."""

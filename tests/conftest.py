@@ -3,11 +3,12 @@
 import os
 import sys
 import tempfile
+from ctypes.util import find_library
 from pathlib import Path
 
 # Before the first import of jax or mujoco: both read these once.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
 import jax

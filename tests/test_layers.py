@@ -20,7 +20,7 @@ LAYERS = [
     {"episode"},
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
-    {"learn", "evaluation", "cli", "progress"},
+    {"learn", "evaluation", "cli", "progress", "scene"},
     {"runs"},
     {"train", "eval", "play", "bench", "export", "sim2sim", "report"},
 ]

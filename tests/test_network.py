@@ -11,9 +11,8 @@ T, E, OBS, J = 6, 4, 7, 3
 SMALL = config.Network(token=8, lstm=10, gru=12, actor=(16, 8), critic=(16, 8))
 
 
-@pytest.fixture(scope="module")
-def actor():
-    return network.Actor(SMALL, J)
+ACTOR = network.Actor(SMALL, J)
+run = jax.jit(ACTOR.apply)
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +20,15 @@ def obs():
     return jax.random.normal(jax.random.key(1), (T, E, OBS))
 
 
-@pytest.fixture(scope="module")
-def params(actor, obs):
-    """Parameters whose biases and head are not near zero, so that every path matters."""
+def untrained(obs):
     start = network.initial_carry(SMALL, E)
-    params = actor.init(jax.random.key(0), start, obs, jnp.zeros((T, E), bool))
+    return jax.jit(ACTOR.init)(jax.random.key(0), start, obs, jnp.zeros((T, E), bool))
+
+
+@pytest.fixture(scope="module")
+def params(obs):
+    """Parameters whose biases and head are not near zero, so that every path matters."""
+    params = untrained(obs)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.key(7), len(leaves))
     shift = lambda key, leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape)
@@ -51,7 +54,7 @@ def test_lstm_agrees_with_flax():
     x = jax.random.normal(jax.random.key(0), (T, E, OBS))
     cell = nn.OptimizedLSTMCell(5, bias_init=nn.initializers.normal(1.0))
     memory = tuple(jax.random.normal(jax.random.key(i), (E, 5)) for i in (1, 2))
-    theirs = cell.init(jax.random.key(3), memory, x[0])["params"]
+    theirs = jax.jit(cell.init)(jax.random.key(3), memory, x[0])["params"]
     ours = {
         "input": {
             "kernel": side_by_side(theirs, ("ii", "if", "ig", "io")),
@@ -59,10 +62,12 @@ def test_lstm_agrees_with_flax():
         },
         "recurrent": side_by_side(theirs, ("hi", "hf", "hg", "ho")),
     }
-    last, hidden = network.LSTM(5).apply({"params": ours}, memory, x, jnp.zeros((T, E), bool))
+    last, hidden = jax.jit(network.LSTM(5).apply)(
+        {"params": ours}, memory, x, jnp.zeros((T, E), bool)
+    )
 
     for t in range(T):
-        memory, expected = cell.apply({"params": theirs}, memory, x[t])
+        memory, expected = jax.jit(cell.apply)({"params": theirs}, memory, x[t])
         np.testing.assert_allclose(hidden[t], expected, atol=1e-6)
     np.testing.assert_allclose(last[0], memory[0], atol=1e-6)
     np.testing.assert_allclose(last[1], memory[1], atol=1e-6)
@@ -72,7 +77,7 @@ def test_gru_agrees_with_flax():
     x = jax.random.normal(jax.random.key(0), (T, E, OBS))
     cell = nn.GRUCell(5, bias_init=nn.initializers.normal(1.0))
     memory = jax.random.normal(jax.random.key(1), (E, 5))
-    theirs = cell.init(jax.random.key(3), memory, x[0])["params"]
+    theirs = jax.jit(cell.init)(jax.random.key(3), memory, x[0])["params"]
     ours = {
         "input": {
             "kernel": side_by_side(theirs, ("ir", "iz", "in")),
@@ -81,10 +86,12 @@ def test_gru_agrees_with_flax():
         "recurrent": side_by_side(theirs, ("hr", "hz", "hn")),
         "candidate_bias": theirs["hn"]["bias"],
     }
-    last, hidden = network.GRU(5).apply({"params": ours}, memory, x, jnp.zeros((T, E), bool))
+    last, hidden = jax.jit(network.GRU(5).apply)(
+        {"params": ours}, memory, x, jnp.zeros((T, E), bool)
+    )
 
     for t in range(T):
-        memory, expected = cell.apply({"params": theirs}, memory, x[t])
+        memory, expected = jax.jit(cell.apply)({"params": theirs}, memory, x[t])
         np.testing.assert_allclose(hidden[t], expected, atol=1e-6)
     np.testing.assert_allclose(last, memory, atol=1e-6)
 
@@ -96,82 +103,82 @@ def test_gradients_through_a_cell_agree_with_finite_differences(cell):
         h = jax.random.normal(jax.random.key(1), (E, 5))
         memory = (h, 0.5 * h) if isinstance(cell, network.LSTM) else h
         begins = some_begins()
-        params = cell.init(jax.random.key(2), memory, x, begins)
+        params = jax.jit(cell.init)(jax.random.key(2), memory, x, begins)
         params = jax.tree.map(lambda p: p.astype(jnp.float64), params)
 
-        def loss(*of):
-            params, memory, x = jax.tree.map(jnp.asarray, of)
+        @jax.jit
+        def loss(params, memory, x):
             last, hidden = cell.apply(params, memory, x, begins)
             return jnp.sum(hidden**2) + sum(jnp.sum(jnp.sin(m)) for m in jax.tree.leaves(last))
 
         check_grads(loss, (params, memory, x), order=1, modes=["rev"], rtol=1e-6)
 
 
-def test_stepping_agrees_with_the_whole_sequence(actor, params, obs):
+def test_stepping_agrees_with_the_whole_sequence(params, obs):
     begins = some_begins()
-    last, whole = actor.apply(params, random_carry(), obs, begins)
+    last, whole = run(params, random_carry(), obs, begins)
 
     carry = random_carry()
     for t in range(T):
-        carry, step = actor.apply(params, carry, obs[t : t + 1], begins[t : t + 1])
+        carry, step = run(params, carry, obs[t : t + 1], begins[t : t + 1])
         np.testing.assert_allclose(step.mean[0], whole.mean[t], atol=1e-5)
         np.testing.assert_allclose(step.velocity[0], whole.velocity[t], atol=1e-5)
         np.testing.assert_allclose(step.gate[0], whole.gate[t], atol=1e-5)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), carry, last)
 
 
-def test_an_episode_start_forgets_everything_before_it(actor, params, obs):
+def test_an_episode_start_forgets_everything_before_it(params, obs):
     begins = jnp.zeros((T, E), bool).at[4].set(True)
-    _, whole = actor.apply(params, random_carry(), obs, begins)
+    _, whole = run(params, random_carry(), obs, begins)
     start = network.initial_carry(SMALL, E)
-    _, fresh = actor.apply(params, start, obs[4:], jnp.zeros((2, E), bool))
+    _, fresh = run(params, start, obs[4:], jnp.zeros((2, E), bool))
     np.testing.assert_allclose(whole.mean[4:], fresh.mean, atol=1e-6)
     np.testing.assert_allclose(whole.velocity[4:], fresh.velocity, atol=1e-6)
 
 
-def test_an_episode_start_forgets_even_what_is_not_finite(actor, params, obs):
+def test_an_episode_start_forgets_even_what_is_not_finite(params, obs):
     begins = jnp.zeros((T, E), bool).at[0].set(True)
     broken = jax.tree.map(lambda m: jnp.full_like(m, jnp.nan), random_carry())
 
     def loss(params, carry):
-        _, out = actor.apply(params, carry, obs, begins)
+        _, out = run(params, carry, obs, begins)
         return jnp.sum(out.mean**2) + jnp.sum(out.velocity**2)
 
-    from_broken = jax.grad(loss)(params, broken)
-    from_empty = jax.grad(loss)(params, network.initial_carry(SMALL, E))
+    from_broken = jax.jit(jax.grad(loss))(params, broken)
+    from_empty = jax.jit(jax.grad(loss))(params, network.initial_carry(SMALL, E))
     jax.tree.map(np.testing.assert_array_equal, from_broken, from_empty)
 
 
-def test_no_gradient_crosses_an_episode_start(actor, params, obs):
+def test_no_gradient_crosses_an_episode_start(params, obs):
     begins = jnp.zeros((T, E), bool).at[4].set(True)
 
     def later(carry, obs):
-        _, out = actor.apply(params, carry, obs, begins)
+        _, out = run(params, carry, obs, begins)
         return jnp.sum(out.mean[4:] ** 2) + jnp.sum(out.velocity[4:] ** 2)
 
-    to_carry, to_obs = jax.grad(later, argnums=(0, 1))(random_carry(), obs)
+    to_carry, to_obs = jax.jit(jax.grad(later, argnums=(0, 1)))(random_carry(), obs)
     assert all(not np.any(g) for g in jax.tree.leaves(to_carry))
     assert not np.any(to_obs[:4])
     assert np.all(np.any(to_obs[4:] != 0.0, axis=-1))
 
 
-def test_memory_reaches_the_action_within_an_episode(actor, params, obs):
+def test_memory_reaches_the_action_within_an_episode(params, obs):
     never = jnp.zeros((T, E), bool)
-    at_the_end = lambda obs: jnp.sum(actor.apply(params, random_carry(), obs, never)[1].mean[-1])
-    reach = jax.grad(at_the_end)(obs)
+    at_the_end = lambda obs: jnp.sum(run(params, random_carry(), obs, never)[1].mean[-1])
+    reach = jax.jit(jax.grad(at_the_end))(obs)
     assert np.all(np.any(reach != 0.0, axis=-1))
 
 
-def test_environments_do_not_see_each_other(actor, params, obs):
-    one = lambda obs: jnp.sum(actor.apply(params, random_carry(), obs, some_begins())[1].mean[:, 1])
-    reach = jax.grad(one)(obs)
+def test_environments_do_not_see_each_other(params, obs):
+    one = lambda obs: jnp.sum(run(params, random_carry(), obs, some_begins())[1].mean[:, 1])
+    reach = jax.jit(jax.grad(one))(obs)
     assert np.any(reach[:, 1]) and not np.any(np.delete(reach, 1, axis=1))
 
 
-def test_the_policy_does_not_train_the_velocity_estimator(actor, params, obs):
+def test_the_policy_does_not_train_the_velocity_estimator(params, obs):
     def gradient(of):
-        loss = lambda p: jnp.sum(of(actor.apply(p, random_carry(), obs, some_begins())[1]) ** 2)
-        return jax.grad(loss)(params)["params"]
+        loss = lambda p: jnp.sum(of(run(p, random_carry(), obs, some_begins())[1]) ** 2)
+        return jax.jit(jax.grad(loss))(params)["params"]
 
     moved = lambda grads, name: any(np.any(g) for g in jax.tree.leaves(grads[name]))
     by_action = gradient(lambda out: out.mean)
@@ -203,26 +210,25 @@ def test_the_highway_gate_chooses_between_memory_and_feature(bias, expected):
     fusion = network.RecurrentFusion(5)
     begins = jnp.zeros((T, E), bool)
     start = jnp.zeros((E, 5))
-    params = fusion.init(jax.random.key(1), start, f, begins)["params"]
+    params = jax.jit(fusion.init)(jax.random.key(1), start, f, begins)["params"]
     params["gate"]["bias"] = jnp.full(3, bias)
-    _, y, gate = fusion.apply({"params": params}, start, f, begins)
+    _, y, gate = jax.jit(fusion.apply)({"params": params}, start, f, begins)
 
-    _, h = network.GRU(5).apply({"params": params["gru"]}, start, f, begins)
+    _, h = jax.jit(network.GRU(5).apply)({"params": params["gru"]}, start, f, begins)
     sides = {"memory": h @ params["memory_out"]["kernel"], "feature": f}
     np.testing.assert_allclose(y, sides[expected], atol=1e-6)
     np.testing.assert_allclose(gate, 1.0 if bias > 0 else 0.0, atol=1e-6)
 
 
-def test_the_first_actions_are_near_zero_and_as_wide_as_configured(actor, obs):
+def test_the_first_actions_are_near_zero_and_as_wide_as_configured(obs):
     start = network.initial_carry(SMALL, E)
-    params = actor.init(jax.random.key(0), start, obs, jnp.zeros((T, E), bool))
-    _, out = actor.apply(params, start, obs, jnp.zeros((T, E), bool))
+    _, out = run(untrained(obs), start, obs, jnp.zeros((T, E), bool))
     assert np.abs(out.mean).max() < 0.05
     np.testing.assert_allclose(np.exp(out.log_std), SMALL.initial_std, rtol=1e-6)
 
 
-def test_shapes_and_names_are_those_that_the_export_relies_on(actor, params, obs):
-    carry, out = actor.apply(params, random_carry(), obs, some_begins())
+def test_shapes_and_names_are_those_that_the_export_relies_on(params, obs):
+    carry, out = run(params, random_carry(), obs, some_begins())
     assert out.mean.shape == (T, E, J)
     assert out.log_std.shape == (J,)
     assert out.velocity.shape == (T, E, 3)
@@ -252,7 +258,8 @@ def test_shapes_and_names_are_those_that_the_export_relies_on(actor, params, obs
 def test_the_critic_judges_each_sample_alone():
     critic = network.Critic(SMALL)
     s = jax.random.normal(jax.random.key(0), (T, E, 9))
-    params = critic.init(jax.random.key(1), s)
-    value = critic.apply(params, s)
+    params = jax.jit(critic.init)(jax.random.key(1), s)
+    judge = jax.jit(critic.apply)
+    value = judge(params, s)
     assert value.shape == (T, E)
-    np.testing.assert_allclose(value[2:3, 1:2], critic.apply(params, s[2:3, 1:2]), atol=1e-6)
+    np.testing.assert_allclose(value[2:3, 1:2], judge(params, s[2:3, 1:2]), atol=1e-6)

@@ -1,4 +1,5 @@
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from cref_jax import config, network, ppo
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
 SMALL = config.Network(token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
+KEY = jax.random.key(0)
 NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
 
 
@@ -20,6 +22,7 @@ def column(*values):
     return jnp.array(values)[:, None]
 
 
+@partial(jax.jit, static_argnums=0)
 def initial_params(seed=0):
     carry, no = network.initial_carry(SMALL, 1), jnp.zeros((1, 1), bool)
     key_actor, key_critic = jax.random.split(jax.random.key(seed))
@@ -31,9 +34,10 @@ def initial_params(seed=0):
     return jax.tree.map(lambda p: 1.5 * p, params)
 
 
-def some_rollout(seed=1, params=None):
+@partial(jax.jit, static_argnums=0)
+def some_rollout(seed=1):
     """A rollout of random numbers, its distribution and values from the policy itself."""
-    params = initial_params() if params is None else params
+    params = initial_params()
     keys = iter(jax.random.split(jax.random.key(seed), 12))
     normal = lambda *shape: jax.random.normal(next(keys), shape)
     obs, critic_obs = normal(T, E, OBS), normal(T, E, CRITIC_OBS)
@@ -59,9 +63,12 @@ def some_rollout(seed=1, params=None):
     )
 
 
-def initial_state(params=None, c=C):
-    params = initial_params() if params is None else params
-    return ppo.initial_state(params, OBS, CRITIC_OBS, c)
+@partial(jax.jit, static_argnums=0)
+def initial_state(c=C):
+    return ppo.initial_state(initial_params(), OBS, CRITIC_OBS, c)
+
+
+judge = jax.jit(lambda rollout: ppo.judge(initial_state().statistics, rollout, C))
 
 
 @jax.jit
@@ -217,14 +224,12 @@ def test_the_gradient_of_the_loss_agrees_with_finite_differences():
     with jax.enable_x64(True):
         wide = lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x
         params = jax.tree.map(wide, initial_params())
-        rollout = jax.tree.map(wide, some_rollout())
-        statistics = initial_state().statistics
-        batch = jax.tree.map(wide, ppo.judge(statistics, rollout, C))
+        batch = jax.tree.map(wide, judge(some_rollout()))
         # the estimator trains on its own loss alone, so the actor is checked without it
         actor = params.actor["params"]
 
+        @jax.jit
         def loss(rest, critic):
-            rest, critic = jax.tree.map(jnp.asarray, (rest, critic))
             moved = ppo.Params({"params": {**actor, **rest}}, critic)
             return ppo.loss(moved, batch, C, NETWORKS)[0]
 
@@ -235,21 +240,21 @@ def test_the_gradient_of_the_loss_agrees_with_finite_differences():
 
 
 def test_ratio_and_kl_of_the_first_minibatch_say_that_nothing_has_moved():
-    _, losses = update(initial_state(), some_rollout(), jax.random.key(0))
+    _, losses = update(initial_state(), some_rollout(), KEY)
     assert losses.kl.shape == (C.epochs, C.minibatches)
     np.testing.assert_allclose(losses.kl[0, 0], 0.0, atol=1e-6)
     assert losses.kl[-1, -1] > 1e-5
 
 
 def test_advantages_are_normalised_over_the_whole_batch():
-    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    batch = judge(some_rollout())
     np.testing.assert_allclose(batch.advantage.mean(), 0.0, atol=1e-6)
     np.testing.assert_allclose(batch.advantage.std(), 1.0, rtol=1e-5)
     assert abs(float(batch.advantage[:, 0].mean())) > 1e-3
 
 
 def test_minibatches_never_mix_time_or_environments():
-    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    batch = judge(some_rollout())
     mark = jnp.arange(T)[:, None] + 100.0 * jnp.arange(E)[None]
     batch = batch._replace(
         value=mark,
@@ -271,7 +276,7 @@ def test_minibatches_never_mix_time_or_environments():
 
 
 def test_minibatches_differ_from_epoch_to_epoch_and_refuse_a_remainder():
-    batch = ppo.judge(initial_state().statistics, some_rollout(), C)
+    batch = judge(some_rollout())
     a, b = (ppo.minibatches(batch, jax.random.key(seed), 2).value for seed in (0, 1))
     assert np.any(a != b)
     with pytest.raises(ValueError, match="8 environments do not split into 3"):
@@ -303,9 +308,8 @@ def test_an_invalid_step_ends_the_horizon_of_those_before_it():
     sound = some_rollout()._replace(terminated=jnp.zeros((T, E), bool))
     broken = sound._replace(valid=sound.valid.at[3].set(False))
     first = jax.tree.map(lambda x: x[:3], sound._replace(carry=()))._replace(carry=sound.carry)
-    statistics = initial_state().statistics
     # returns, since advantages are normalised over other samples
-    whole, part = ppo.judge(statistics, broken, C), ppo.judge(statistics, first, C)
+    whole, part = judge(broken), judge(first)
     np.testing.assert_allclose(whole.returns[:3], part.returns, atol=1e-6)
 
 
@@ -320,7 +324,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     bad = jax.tree.map(lambda p: jnp.full_like(p, jnp.nan), state.params)
     bad = state.params._replace(critic=bad.critic)
     opt = ppo.optimiser(C)
-    changes, after = opt.update(bad, state.opt_state, state.params)
+    changes, after = jax.jit(opt.update)(bad, state.opt_state, state.params)
     assert not any(np.any(x) for x in jax.tree.leaves(changes))
     assert int(after.total_notfinite) == 1 and int(after.notfinite_count) == 1
     assert_same(after.inner_state, state.opt_state.inner_state)
@@ -329,7 +333,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
 def test_an_update_of_bad_gradients_changes_no_parameter():
     # a valid sample whose reward overflows the value loss
     rollout = some_rollout()._replace(reward=jnp.full((T, E), 3e38))
-    state, losses = update(initial_state(), rollout, jax.random.key(0))
+    state, losses = update(initial_state(), rollout, KEY)
     assert losses.skipped.all()
     assert int(state.opt_state.total_notfinite) == C.epochs * C.minibatches
     assert int(state.opt_state.notfinite_count) == C.epochs * C.minibatches
@@ -372,8 +376,9 @@ def test_the_learning_rate_is_part_of_the_state_and_goes_on_from_there():
 def test_the_learning_rate_scales_the_step():
     # Adam's first step is the rate times the sign of each gradient
     one = config.PPO(epochs=1, minibatches=1, learning_rate=1e-4)
-    state = initial_state(c=one)
-    after, losses = ppo.update(state, some_rollout(), jax.random.key(0), one, NETWORKS)
+    state = initial_state(one)
+    learn = jax.jit(lambda state: ppo.update(state, some_rollout(), KEY, one, NETWORKS))
+    after, losses = learn(state)
     moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, state.params)
     largest = max(float(m) for m in jax.tree.leaves(moved))
     np.testing.assert_allclose(largest, losses.learning_rate[0, 0], rtol=1e-2)

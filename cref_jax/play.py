@@ -1,0 +1,303 @@
+"""Watch a robot walk: `python -m cref_jax.play --run runs/NAME`.
+
+Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from ctypes.util import find_library
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeVar
+
+# Here, because mujoco reads it at its first import, and fails there if the library is missing.
+if sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
+    has = [name for name, file in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(file)]
+    os.environ.setdefault("MUJOCO_GL", has[0] if has else "off")
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from PIL import Image
+from rich.progress import track
+
+from cref_jax import cli, config, evaluation, lanes, ppo, rollout, runs, scene
+from cref_jax.config import Config, ConfigError
+from cref_jax.lanes import Atlas
+from cref_jax.world import World
+
+T = TypeVar("T")
+Agent = Literal["trained", "stand", "random"]
+Level = int | Literal["easy", "medium", "hard", "ood"]
+
+FRAME_RATE = 25.0  # 1/s
+WIDTH, HEIGHT = 960, 540  # pixels of the video
+STILL_WIDTH = 480  # pixels of one still; its height is HEIGHT
+MAX_SECONDS = 600.0
+
+ENDINGS = {  # of an episode, by its name in episode.Ending
+    "tilted": "fell, tilted too far",
+    "low": "fell, its pelvis too low",
+    "hit": "fell, its upper body on the ground",
+    "dropped": "stepped into the depth",
+    "unstable": "blew up in the simulation",
+    "finished": "came to the end of the lane",
+    "timeout": "ran out of time",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let one robot walk along a lane, without noise or pushes, and film it."""
+
+    run: Path | None = None
+    """runs/NAME; the newest one when left out"""
+    agent: Agent = "trained"
+    """trained: the run's policy; stand: hold the nominal pose; random: an untrained policy's noise;
+    the last two need no run"""
+    terrain: str | None = None
+    """flat, rough, slope, stairs, gap, platform, mixed, or a height map; the run's when left out"""
+    kind: str | None = None
+    """kind of lane, such as stairs_down; the terrain's first when left out"""
+    level: Level | None = None
+    """0 (easiest) to 9, or the name of a size of Table II; the middle one when left out"""
+    command: float = 0.6
+    """m/s forward"""
+    seconds: float = 10.0
+    """length; it ends earlier where the robot falls or the lane ends"""
+    seed: int = 0
+    """of the first state and of the random agent"""
+    stills: int = 0
+    """write a picture of so many moments side by side instead of a video"""
+    out: Path | None = None
+    """.mp4, or .png for stills; play.mp4 in the folder of the run when left out"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class Recording(NamedTuple):
+    """What was seen of one robot until its episode or the time ended."""
+
+    qpos: Float[np.ndarray, "T Q"]  # before each control step
+    airborne: Bool[np.ndarray, "T F"]
+    progress: float  # m along the lane
+    ending: str | None  # a field of episode.Ending; None: the time was over
+
+
+class Step(NamedTuple):
+    """What is kept of a control step."""
+
+    qpos: Float[Array, " Q"]  # before it
+    airborne: Bool[Array, " F"]
+    progress: Float[Array, ""]  # m
+    ending: dict[str, Bool[Array, ""]]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.play")
+    with cli.one_line_errors(options.debug):
+        cli.use_compile_cache()
+        play(options)
+
+
+def play(options: Options) -> None:
+    """Let the robot walk, show it, and say how it went."""
+    _check(options)
+    if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
+        jax.config.update("jax_platforms", "cpu")
+    run = options.run or runs.newest() if options.agent == "trained" else options.run
+    c = runs.read_config(run) if run else Config()
+    out = _writable(options, run)
+    world = _world(options, c)
+    train = runs.load_policy(run, world).train if run and options.agent == "trained" else None
+    period = c.physics.control_period
+    model = scene.build(c.robot.actuated, c.physics, world.lanes.tile(0, 0))
+    with scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
+        recording = record(world, train, options)
+        if options.stills:
+            moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
+            _write_stills(out, _film(canvas, recording, moments, period))
+        else:
+            stride = max(1, round(1.0 / (FRAME_RATE * period)))
+            moments = np.arange(0, len(recording.qpos), stride)
+            _write_video(out, _film(canvas, recording, moments, period), 1.0 / (stride * period))
+    print(f"wrote {out}")
+    print(summary(recording, options.command, period))
+
+
+def record(world: World, train: ppo.TrainState | None, options: Options) -> Recording:
+    """Return what one robot does until its episode or the time ends."""
+    key_start, key_act = jax.random.split(jax.random.key(options.seed))
+    robots = jax.jit(rollout.start, static_argnums=2)(world, key_start, 1)
+    robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
+    steps: list[Step] = []
+    count = max(1, round(options.seconds / world.config.physics.control_period))
+    for key in _tracked(jax.random.split(key_act, count), "walking"):
+        robots, step = _advance(world, options.agent, train, robots, key)
+        steps.append(jax.tree.map(np.asarray, step))
+        if any(steps[-1].ending.values()):
+            break
+    over = [name for name, flag in steps[-1].ending.items() if flag]
+    return Recording(
+        qpos=np.stack([step.qpos for step in steps]),
+        airborne=np.stack([step.airborne for step in steps]),
+        progress=float(steps[-1].progress),
+        ending=over[0] if over else None,
+    )
+
+
+def summary(recording: Recording, command: float, period: float) -> str:
+    """Return how it went, in two lines."""
+    seconds = len(recording.qpos) * period
+    left, right = recording.airborne.mean(axis=0)
+    fate = ENDINGS[recording.ending] if recording.ending else "was still on its feet"
+    return (
+        f"walked {recording.progress:.2f} m in {seconds:.1f} s, {recording.progress / seconds:.2f} "
+        f"of {command:.2f} m/s asked for, and {fate}\n"
+        f"off the ground: left foot {left:.0%}, right foot {right:.0%} of the time"
+    )
+
+
+@functools.partial(jax.jit, static_argnames="agent")
+def _advance(
+    world: World,
+    agent: Agent,
+    train: ppo.TrainState | None,
+    robots: rollout.Robots,
+    key: PRNGKeyArray,
+) -> tuple[rollout.Robots, Step]:
+    """Step the robot with the agent's action."""
+    c = world.config.network
+    joints = len(world.physics.robot.joint_names)
+    memory, action = robots.memory, jnp.zeros((1, joints))
+    if train is not None:
+        memory, policy = rollout.act(rollout.networks(c, joints), train, robots)
+        action = policy.mean[0]
+    elif agent == "random":
+        action = c.initial_std * jax.random.normal(key, action.shape)
+    after, outcome = rollout.advance(world, robots, memory, action)
+    step = Step(
+        qpos=robots.env.body.qpos[0],
+        airborne=outcome.measures.airborne[0],
+        progress=outcome.measures.progress[0],
+        ending={name: flag[0] for name, flag in outcome.ending._asdict().items()},
+    )
+    return after, step
+
+
+def _check(options: Options) -> None:
+    """Refuse numbers that make no film."""
+    if not 0.0 < options.seconds <= MAX_SECONDS:
+        raise ConfigError(f"--seconds must be above 0, up to {MAX_SECONDS:g}: {options.seconds:g}")
+    if not math.isfinite(options.command):
+        raise ConfigError(f"--command must be a number, m/s: {options.command}")
+    if options.stills < 0:
+        raise ConfigError(f"--stills must not be below 0: {options.stills}")
+
+
+def _writable(options: Options, run: Path | None) -> Path:
+    """Return the file to write, its folder made."""
+    suffix = ".png" if options.stills else ".mp4"
+    out = options.out or (run or Path()) / f"play{suffix}"
+    if out.suffix != suffix:
+        raise ConfigError(f"--out must end in {suffix}: {out}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
+    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
+        raise ConfigError(f"cannot write {out}")
+    return out
+
+
+def _world(options: Options, c: Config) -> World:
+    """Return the world with one lane, and with what the run does not say about walking."""
+    c = dataclasses.replace(
+        c, terrain=dataclasses.replace(c.terrain, name=options.terrain or c.terrain.name)
+    )
+    atlas = _lane(c.terrain, options)
+    c = evaluation.evaluation_config(c, seconds=options.seconds + 1.0)  # it does not end by itself
+    c = dataclasses.replace(
+        c, command=dataclasses.replace(c.command, lane_vx=(options.command, options.command))
+    )
+    return runs.world_of(c, "mujoco").replace(lanes=atlas)
+
+
+def _lane(c: config.Terrain, options: Options) -> Atlas:
+    """Return the one lane that the options name.
+
+    Raises:
+        ConfigError: there is no such terrain, kind or level.
+    """
+    atlas = lanes.build(c)
+    kind = options.kind or atlas.kinds[0]
+    if kind not in atlas.kinds:
+        raise ConfigError(config.unknown("kind", kind, list(atlas.kinds)))
+    level = atlas.levels // 2 if options.level is None else options.level
+    if isinstance(level, str):
+        named = lanes.named_sizes(c, kind)
+        if not named:
+            raise ConfigError(f"'{kind}' has no level '{level}'; take 0 to {atlas.levels - 1}")
+        return lanes.single(c, kind, named[level])
+    if not 0 <= level < atlas.levels:
+        raise ConfigError(f"--level must be 0 to {atlas.levels - 1}, not {level}")
+    if atlas.sizes.size == 1:
+        return atlas
+    return lanes.single(c, kind, float(atlas.sizes[level, atlas.kinds.index(kind)]))
+
+
+def _film(
+    canvas: scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], period: float
+) -> Iterator[scene.Frame]:
+    """Yield the pictures of the robot after so many control steps."""
+    points = scene.camera_path(recording.qpos, period)
+    for t in _tracked(moments, "drawing"):
+        yield canvas.draw(recording.qpos[t], points[t])
+
+
+def _tracked(items: Iterable[T], title: str) -> Iterable[T]:
+    """Yield the items, with a progress bar on a terminal."""
+    return track(items, title, transient=True, disable=not sys.stdout.isatty())
+
+
+def _write_stills(out: Path, frames: Iterable[scene.Frame]) -> None:
+    """Write pictures side by side as one."""
+    try:
+        Image.fromarray(np.concatenate(list(frames), axis=1)).save(out)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def _write_video(out: Path, frames: Iterable[scene.Frame], rate: float) -> None:
+    """Write pictures as a film of `rate` pictures a second."""
+    part = out.with_suffix(".part.mp4")  # a film that was cut off does not replace a whole one
+    source = f"-f rawvideo -pix_fmt rgb24 -s {WIDTH}x{HEIGHT} -r {rate:g} -i -"
+    target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags faststart"
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
+    command = [*program, *source.split(), *target.split(), str(part)]
+    try:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+            assert ffmpeg.stdin and ffmpeg.stderr
+            with contextlib.suppress(BrokenPipeError):  # it says why, and exits
+                for frame in frames:
+                    ffmpeg.stdin.write(frame.tobytes())
+            said = ffmpeg.communicate()[1].decode(errors="replace").strip()
+        if ffmpeg.returncode:
+            raise ConfigError(f"cannot write {out}: {said.splitlines()[-1] if said else 'ffmpeg'}")
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""A small world and robots in it, made once and shared by the tests of episode and environment."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cref_jax import config, episode
+from cref_jax.config import Config
+from cref_jax.episode import EnvState
+from cref_jax.physics import Physics
+from cref_jax.world import World, make_world
+
+C = config.override(
+    Config(),
+    {"terrain": {"name": "mixed", "levels": 3, "lane_width": 1.0}, "episode": {"bank_size": 8}},
+)
+ROBOTS = 8
+
+
+@functools.cache
+def world() -> World:
+    """Return lanes of every kind; the engine is MuJoCo C."""
+    return make_world(C, Physics(C.robot, C.physics, "mujoco", threads=2))
+
+
+@functools.cache
+def resets() -> EnvState:
+    """Return 512 robots at their start, of every kind and level in turn."""
+    number = jnp.arange(512)
+    kinds, levels = number % len(world().lanes.kinds), number // len(world().lanes.kinds) % 3
+    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
+    return reset(world(), jax.random.split(jax.random.key(3), 512), kinds, levels)
+
+
+def robots() -> EnvState:
+    """Return eight robots, one a kind and two on level ground."""
+    return one(resets(), np.arange(ROBOTS))
+
+
+def one(tree, index=0):
+    """Return the part of a batch at `index`."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def put(state: EnvState, **changes) -> EnvState:
+    """Return the state with the base's `x y z rotation` and the fields of the state changed."""
+    qpos = state.body.qpos
+    for key, where in {"x": 0, "y": 1, "z": 2, "rotation": slice(3, 7)}.items():
+        if key in changes:
+            qpos = qpos.at[..., where].set(changes.pop(key))
+    return state.replace(body=state.body._replace(qpos=qpos), **changes)
+
+
+def on(kind: str, state: EnvState, level: int = 0) -> EnvState:
+    """Return the state moved to a lane of this kind."""
+    return state.replace(kind=jnp.int32(world().lanes.kinds.index(kind)), level=jnp.int32(level))
+
+
+def assert_equal(a, b) -> None:
+    """Assert that two trees are the same, bit for bit."""
+    raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(raw(x), raw(y)), a, b)

@@ -1,0 +1,230 @@
+"""The step of one robot: what it does with an action, and what the learner gets.
+
+The engine is MuJoCo C. Every test steps the same eight robots, so `step` is compiled once.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sample
+from sample import ROBOTS, C, assert_equal, one, put
+
+from cref_jax import config, env, observation
+from cref_jax.physics import Physics
+
+LENGTH = C.terrain.lane_length
+
+
+@pytest.fixture
+def world():
+    return sample.world()
+
+
+@pytest.fixture
+def resets():
+    return sample.resets()
+
+
+@pytest.fixture
+def robots():
+    return sample.robots()
+
+
+@pytest.fixture(scope="module")
+def step():
+    return jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
+
+
+def still(robots):
+    """Return actions that ask for the nominal pose."""
+    return jnp.zeros((ROBOTS, robots.action.shape[-1]))
+
+
+def test_a_timeout_gives_a_fresh_robot_and_the_last_state_of_the_old_one(world, step, robots):
+    early, late = (
+        robots.replace(step=jnp.full(ROBOTS, 500, jnp.int32)),
+        robots.replace(step=jnp.full(ROBOTS, 999, jnp.int32)),
+    )
+    going, seen = step(world, early, still(robots))
+    fresh, last = step(world, late, still(robots))
+    assert last.ending.timeout.all() and last.ending.truncated.all()
+    assert not last.ending.terminated.any() and not seen.ending.truncated.any()
+    # the state that the step has led to, which the other robots go on from
+    np.testing.assert_array_equal(last.last_privileged, seen.last_privileged)
+    np.testing.assert_array_equal(seen.last_privileged, seen.observation.privileged)
+    np.testing.assert_array_equal(last.reward, seen.reward)
+    np.testing.assert_array_equal(going.step, 501)
+    # the observation is of the fresh robot
+    see = jax.vmap(lambda state: env.observe(world, state, jax.random.key(0)))
+    expected = jax.jit(see)(fresh)
+    np.testing.assert_allclose(last.observation.privileged, expected.privileged, atol=1e-6)
+    np.testing.assert_allclose(last.observation.velocity, expected.velocity, atol=1e-6)
+    np.testing.assert_array_equal(fresh.step, 0)
+    np.testing.assert_array_equal(fresh.kind, robots.kind)
+    low, high = C.episode.start_x
+    assert (low <= fresh.body.qpos[:, 0]).all() and (fresh.body.qpos[:, 0] <= high).all()
+    assert (fresh.dynamics.friction != robots.dynamics.friction).all()  # drawn anew
+
+
+def test_reaching_the_end_of_a_lane_truncates_and_raises_the_level(world, step, robots):
+    is_open = np.asarray(robots.kind) == world.lanes.kinds.index("flat")
+    level = robots.level
+    after, outcome = step(world, put(robots, x=LENGTH - 0.9), still(robots))
+    np.testing.assert_array_equal(outcome.ending.finished, ~is_open)
+    np.testing.assert_array_equal(outcome.ending.truncated, ~is_open)
+    np.testing.assert_array_equal(after.level, level + ~is_open)
+
+
+def test_a_robot_that_blows_up_gains_nothing_and_leaves_its_neighbours_alone(world, step, robots):
+    broken = put(robots, z=robots.body.qpos[:, 2].at[3].set(jnp.nan))
+    sound, expected = step(world, robots, still(robots))
+    after, outcome = step(world, broken, still(robots))
+    np.testing.assert_array_equal(outcome.ending.unstable, np.arange(ROBOTS) == 3)
+    assert outcome.ending.terminated[3] and outcome.reward[3] == 0.0
+    others = np.delete(np.arange(ROBOTS), 3)
+    assert_equal(one(after, others), one(sound, others))
+    assert_equal(one(outcome, others), one(expected, others))
+    finite = jax.tree.map(lambda x: bool(jnp.isfinite(x).all()), (after.body, outcome.observation))
+    assert all(jax.tree.leaves(finite))
+
+
+def test_a_step_that_blows_up_is_judged_by_the_state_before_it(world, step, robots):
+    fast = robots.replace(body=robots.body._replace(qvel=robots.body.qvel.at[2, 8].set(1e3)))
+    after, outcome = step(world, fast, still(robots))
+    assert outcome.ending.unstable[2] and outcome.reward[2] == 0.0
+    np.testing.assert_array_equal(outcome.ending.unstable.sum(), 1)
+    assert bool(jnp.isfinite(outcome.last_privileged).all())
+    np.testing.assert_array_equal(after.step[2], 0)
+
+
+def test_a_delayed_action_arrives_later_in_the_step(world, step, robots):
+    alike = jax.tree.map(lambda x: jnp.stack([x] * ROBOTS), one(robots))
+    alike = alike.replace(delay=jnp.array([0, 1, 2, 3, 4, 4, 0, 2], jnp.int32))
+    calm, _ = step(world, alike, still(robots))
+    moved, _ = step(world, alike, still(robots).at[:, 3].set(1.0))
+    felt = np.abs(np.asarray(moved.body.qvel - calm.body.qvel)).max(axis=1)
+    assert felt[4] == felt[5] == 0.0  # 20 ms: not before the next step
+    assert (np.diff(felt[:5]) < 0.0).all()
+    again, _ = step(world, moved, still(robots).at[:, 3].set(1.0))
+    rest, _ = step(world, calm, still(robots))
+    assert np.abs(np.asarray(again.body.qvel - rest.body.qvel))[4].max() > 0.1
+
+
+def test_an_encoders_offset_is_seen_and_shifts_what_is_reached(world, step, robots):
+    # q reads q + offset, so the target for the motor is q0 + scale * a - offset
+    shift = 0.03 * jnp.sin(jnp.arange(robots.action.shape[-1]))
+    straight = robots.replace(joint_offset=jnp.zeros_like(robots.joint_offset))
+    straight = straight.replace(delay=jnp.zeros_like(robots.delay))
+    crooked = straight.replace(joint_offset=jnp.tile(shift, (ROBOTS, 1)))
+    action = 0.5 * jnp.cos(still(robots) + jnp.arange(12.0))
+    by_action, _ = step(world, straight, action - shift / world.physics.robot.action_scale)
+    by_offset, _ = step(world, crooked, action)
+    np.testing.assert_allclose(by_offset.body.qpos, by_action.body.qpos, atol=1e-5)
+    exact = dict.fromkeys((f.name for f in dataclasses.fields(config.Randomisation)), 0.0)
+    exact = {name: value for name, value in exact.items() if name.startswith("noise")}
+    quiet = world.replace(config=config.override(C, {"randomisation": exact}))
+    part = observation.slices(12)["joint_position"]
+    see = lambda state: env.observe(quiet, one(state), jax.random.key(0))
+    seen, true = see(crooked), see(straight)
+    np.testing.assert_allclose(
+        seen.proprioception[part] - true.proprioception[part], shift, atol=1e-6
+    )
+    np.testing.assert_array_equal(seen.privileged, true.privileged)  # the critic sees the joints
+
+
+def test_the_same_key_gives_the_same_trajectory_and_another_one_another(world, step, robots):
+    def run(state):
+        for k in range(10):
+            state, outcome = step(world, state, jnp.sin(k + still(robots) + jnp.arange(12.0)))
+        return state, outcome
+
+    first, again = run(robots), run(robots)
+    assert_equal(first, again)
+    other = run(robots.replace(key=jax.random.split(jax.random.key(99), ROBOTS)))
+    assert (first[1].observation.proprioception != other[1].observation.proprioception).any()
+
+
+def test_an_environment_alone_is_the_same_one_as_in_a_batch(world, step, robots):
+    alone, batch = one(robots, 5), robots
+    single = jax.jit(env.step)
+    for k in range(20):
+        action = jnp.sin(k + still(robots) + jnp.arange(12.0))
+        batch, together = step(world, batch, action)
+        alone, by_itself = single(world, alone, action[5])
+        # not bit for bit: XLA may round a fused sum in another order
+        compare = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+        jax.tree.map(compare, alone.body, one(batch.body, 5))
+        jax.tree.map(compare, by_itself.observation, one(together.observation, 5))
+        compare(by_itself.reward, together.reward[5])
+
+
+def lived(world, state, force):
+    """Return the state a step later and its snapshot, had it ended with this force on the feet."""
+    links = world.physics.links(state.body)
+    snapshot = env._snapshot(world, state, state.body, links, force, state.action)
+    return env._lived(state, state.body, snapshot, C.reward), snapshot
+
+
+def test_contacts_time_the_phases_of_a_gait(world, robots):
+    """Five steps of 20 ms: both feet, right, right, both, left."""
+    state = one(robots)
+    live = jax.jit(lambda s, force: lived(world, s, force))
+    on_ground = [(1, 1), (0, 1), (0, 1), (1, 1), (1, 0)]
+    first, ended, air, since = [], [], [], []
+    for touching in on_ground:
+        # 5 N and less do not count
+        force = jnp.array([[0.0, 0.0, 200.0 if foot else 5.0] for foot in touching])
+        state, snapshot = live(state, force)
+        first.append(snapshot.first_contact.tolist())
+        ended.append(snapshot.air_time.tolist())
+        air.append(state.air_time.tolist())
+        since.append(float(snapshot.since_single))
+    # the start counts as on the ground, so only the left foot comes down, in the fourth step
+    assert first == [[False] * 2, [False] * 2, [False] * 2, [True, False], [False] * 2]
+    # off the ground in steps 2 and 3: the contact comes within 0.06 s of leaving
+    np.testing.assert_allclose(ended[3][0], 0.06, atol=1e-6)
+    expected = [[0, 0], [0.02, 0], [0.04, 0], [0, 0], [0, 0.02]]
+    np.testing.assert_allclose(air, expected, atol=1e-6)
+    np.testing.assert_allclose(since, [0.02, 0, 0, 0.02, 0], atol=1e-6)
+
+
+def test_the_support_stays_at_its_last_height_while_both_feet_are_in_the_air(world, robots):
+    state = one(robots)
+    links = world.physics.links(state.body)
+    feet = np.asarray(links.position[world.physics.feet, 2])
+    down = jnp.array([[0.0, 0.0, 9.0], [0.0, 0.0, 0.0]])
+    left, _ = lived(world, state, down)
+    np.testing.assert_allclose(left.support_z, feet[0], atol=1e-6)
+    up, _ = lived(world, put(left, z=2.0), 0.0 * down)
+    np.testing.assert_array_equal(up.support_z, left.support_z)
+
+
+def random_walk(world, state, steps: int):
+    """Return every step's outcome under actions from a normal distribution."""
+
+    def once(state, key):
+        action = jax.random.normal(key, state.action.shape)
+        state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, state, action)
+        finite = jax.tree.map(lambda x: jnp.isfinite(x).all(), (state.body, outcome.observation))
+        sound = jnp.stack(jax.tree.leaves(finite)).all() & jnp.isfinite(outcome.reward).all()
+        return state, (sound, outcome.ending)
+
+    keys = jax.random.split(jax.random.key(0), steps)
+    return jax.jit(lambda s: jax.lax.scan(once, s, keys)[1])(state)
+
+
+@pytest.mark.slow
+def test_512_robots_survive_10_s_of_random_actions(world, resets):
+    sound, ending = random_walk(world, resets, steps=500)
+    assert sound.all() and not ending.unstable.any()
+    assert ending.terminated.sum() > 512  # they have fallen, and gone on
+
+
+@pytest.mark.slow
+def test_64_robots_survive_2_s_of_random_actions_in_mjx(world, resets):
+    in_mjx = world.replace(physics=Physics(C.robot, C.physics, "mjx"))
+    sound, ending = random_walk(in_mjx, one(resets, np.arange(64)), steps=100)
+    assert sound.all() and not ending.unstable.any()

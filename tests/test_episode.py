@@ -1,0 +1,298 @@
+"""An episode of one robot: its start, what disturbs it, how it ends and what follows."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sample
+from sample import ROBOTS, C, assert_equal, on, one, put
+
+from cref_jax import config, episode, geometry, kinematics, terrain
+from cref_jax.episode import Ending
+
+LENGTH = C.terrain.lane_length
+PERIOD = C.physics.control_period
+
+
+@pytest.fixture
+def world():
+    return sample.world()
+
+
+@pytest.fixture
+def resets():
+    return sample.resets()
+
+
+@pytest.fixture
+def robots():
+    return sample.robots()
+
+
+# The start
+
+
+def test_a_robot_starts_from_a_settled_state_turned_and_moved_in_its_lane(world, resets):
+    c, bank = C.episode, world.bank
+    qpos, qvel = np.asarray(resets.body.qpos), np.asarray(resets.body.qvel)
+    same = (qpos[:, None, 7:] == np.asarray(bank.qpos)[None, :, 7:]).all(-1)
+    assert same.sum(axis=1).tolist() == [1] * len(qpos)  # one state of the bank, its joints as is
+    assert same.any(axis=0).all()  # and each of them is used
+    source = same.argmax(axis=1)
+    np.testing.assert_array_equal(qpos[:, 2], bank.qpos[source, 2])
+    np.testing.assert_array_equal(qvel[:, 3:], bank.qvel[source, 3:])
+    for column, (low, high) in ((0, c.start_x), (1, c.start_y)):
+        assert low <= qpos[:, column].min() < low + 0.05
+        assert high - 0.05 < qpos[:, column].max() <= high
+    np.testing.assert_array_equal(resets.start, qpos[:, :2])
+    turn = np.asarray(geometry.yaw(resets.body.qpos[:, 3:7]) - geometry.yaw(bank.qpos[source, 3:7]))
+    assert 0.95 * c.yaw_jitter < np.abs(turn).max() <= c.yaw_jitter + 1e-5
+    own_frame = lambda body: geometry.rotate_inverse(body.qpos[:, 3:7], body.qvel[:, :3])
+    expected = own_frame(one(world.bank, source))
+    np.testing.assert_allclose(own_frame(resets.body), expected, atol=1e-6)
+
+
+def test_a_robot_starts_standing_on_its_lane(world, resets):
+    spheres = world.physics.robot.spheres
+
+    def clearance(state):
+        ground = world.lanes.tile(state.level, state.kind)
+        links = world.physics.links(state.body)
+        centre = kinematics.points(links, spheres.body, spheres.position)
+        return centre[:, 2] - spheres.radius - terrain.height_at(ground, centre[:, :2])
+
+    lowest = np.asarray(jax.jit(jax.vmap(clearance))(resets)).min(axis=1)
+    assert lowest.min() > -0.005 and lowest.max() < 0.001
+    assert np.abs(resets.body.qvel[:, :3]).max() < 0.2
+    np.testing.assert_array_equal(resets.step, 0)
+
+
+def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, resets):
+    r, nominal = C.randomisation, world.physics.nominal_dynamics()
+    drawn = resets.dynamics
+    for values, low, high in (
+        (drawn.friction, *r.friction),
+        (drawn.payload, -r.trunk_mass, r.trunk_mass),
+        (drawn.com_shift, -r.trunk_com, r.trunk_com),
+        (drawn.kp / nominal.kp, *r.gains),
+        (drawn.kd / nominal.kd, *r.gains),
+        (resets.joint_offset, -r.joint_offset, r.joint_offset),
+    ):
+        values, slack = np.asarray(values), 1e-5 * (high - low)
+        assert (values.min(axis=0) >= low - slack).all() and (
+            values.max(axis=0) <= high + slack
+        ).all()
+        assert (np.ptp(values, axis=0) > 0.97 * (high - low)).all()
+    # 0 to 20 ms in substeps of 5 ms
+    assert sorted(set(np.asarray(resets.delay).tolist())) == [0, 1, 2, 3, 4]
+
+
+def test_without_randomisation_every_robot_is_the_nominal_one(world):
+    c = config.override(C, {"randomisation": {"enabled": False}})
+    state = episode.reset(world.replace(config=c), jax.random.key(0), jnp.int32(1), jnp.int32(0))
+    assert_equal(state.dynamics, world.physics.nominal_dynamics())
+    assert not state.joint_offset.any() and int(state.delay) == 0
+
+
+# The command
+
+
+def test_on_a_lane_the_command_goes_forward_and_on_open_ground_anywhere(world, resets):
+    c, command = C.command, np.asarray(resets.command)
+    is_open = np.asarray(resets.kind) == world.lanes.kinds.index("flat")
+    along = command[~is_open]
+    assert c.lane_vx[0] <= along[:, 0].min() and along[:, 0].max() <= c.lane_vx[1]
+    np.testing.assert_array_equal(along[:, 1:], 0.0)
+    free = command[is_open]
+    standing = (free == 0.0).all(axis=1)
+    assert 0 < standing.sum() < 0.3 * len(free)
+    for column, (low, high) in enumerate((c.vx, c.vy, c.yaw_rate)):
+        assert low <= free[:, column].min() and free[:, column].max() <= high
+        assert np.ptp(free[:, column]) > 0.8 * (high - low)
+
+
+@pytest.mark.parametrize(
+    ("y", "heading", "expected"),
+    [
+        (0.5, 0.0, -0.25),  # 0.5 rad/m * 0.5 m to the right, by 1 rad/s a radian
+        (0.5, 0.2, -0.45),  # and 0.2 rad more, as it heads to the left
+        (0.0, -0.3, 0.3),
+        (3.0, 0.05, -0.55),  # no more than 0.5 rad off the lane's direction, 0.05 to be undone
+        (3.0, 0.3, -0.6),  # the limit of the yaw rate
+        (0.0, 3.1, -0.6),  # the short way round
+        (0.0, -3.1, 0.6),
+    ],
+)
+def test_a_robot_on_a_lane_is_steered_to_its_middle(world, robots, y, heading, expected):
+    state = on("gap", one(robots)).replace(command_left=jnp.int32(9))
+    about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.float32(heading))
+    steered = episode.commanded(world, put(state, y=y, rotation=about_z), jax.random.key(0))
+    np.testing.assert_allclose(steered.command[2], expected, atol=1e-5)
+    np.testing.assert_array_equal(steered.command[:2], state.command[:2])
+
+
+def test_whoever_obeys_the_steering_ends_in_the_middle_of_the_lane(world, robots):
+    state = on("gap", one(robots)).replace(command=jnp.array([0.5, 0.0, 0.0]))
+
+    def walk(pose, _):
+        x, y, heading = pose
+        rotation = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
+        here = put(state, x=x, y=y, rotation=rotation).replace(command_left=jnp.int32(9))
+        vx, _, rate = episode.commanded(world, here, jax.random.key(0)).command * PERIOD
+        return (x + vx * jnp.cos(heading), y + vx * jnp.sin(heading), heading + rate), None
+
+    start = (jnp.float32(0.5), jnp.float32(0.4), jnp.float32(0.9))
+    (x, y, heading), _ = jax.jit(lambda s: jax.lax.scan(walk, s, None, length=1000))(start)
+    assert abs(y) < 0.05 and abs(heading) < 0.05 and x > 9.0  # 20 s at 0.5 m/s
+
+
+def test_on_open_ground_the_yaw_rate_is_the_drawn_one(world, robots):
+    state = on("flat", one(robots))
+    state = put(state, y=0.5).replace(command=jnp.array([0.5, 0.1, 0.7]), command_left=jnp.int32(9))
+    after = episode.commanded(world, state, jax.random.key(0))
+    np.testing.assert_array_equal(after.command, state.command)
+    # |(0.5, 0.1)| * 0.02 s
+    np.testing.assert_allclose(after.commanded - state.commanded, 0.51 * PERIOD, rtol=1e-3)
+
+
+def test_a_new_command_is_drawn_only_when_it_is_due(world, robots):
+    state = on("gap", one(robots))
+    kept = episode.commanded(world, state.replace(command_left=jnp.int32(1)), jax.random.key(1))
+    assert float(kept.command[0]) == float(state.command[0]) and int(kept.command_left) == 0
+    drawn = episode.commanded(world, kept, jax.random.key(1))
+    assert float(drawn.command[0]) != float(state.command[0])
+    assert 400 <= int(drawn.command_left) <= 600  # 8 to 12 s
+
+
+# Pushes
+
+
+def test_a_push_changes_the_planar_velocity_and_only_when_due(world, robots):
+    state = one(robots)
+    waits = episode.pushed(world, state.replace(push_left=jnp.int32(1)), jax.random.key(0))
+    assert_equal(waits.body, state.body)
+    assert int(waits.push_left) == 0
+    keys = jax.random.split(jax.random.key(0), 300)
+    after = jax.vmap(lambda key: episode.pushed(world, waits, key))(keys)
+    change = np.asarray(after.body.qvel - state.body.qvel)
+    np.testing.assert_array_equal(change[:, 2:], 0.0)
+    assert 0.95 < np.abs(change[:, :2]).max() <= C.randomisation.push_velocity + 1e-6
+    assert np.abs(change[:, :2].mean(axis=0)).max() < 0.15
+    np.testing.assert_array_equal(after.body.qpos, np.tile(state.body.qpos, (300, 1)))
+    assert (after.push_left >= 250).all() and (after.push_left <= 500).all()  # 5 to 10 s
+
+
+def test_nobody_is_pushed_without_randomisation(world, robots):
+    calm = world.replace(config=config.override(C, {"randomisation": {"enabled": False}}))
+    state = one(robots).replace(push_left=jnp.int32(0))
+    assert_equal(episode.pushed(calm, state, jax.random.key(0)), state)
+
+
+# The end
+
+
+@pytest.fixture(scope="module")
+def causes():
+    world = sample.world()
+    judge = jax.jit(
+        lambda state: episode.ending(
+            world, state, world.physics.links(state.body), jnp.zeros((), bool)
+        )
+    )
+    return lambda state: {name for name, value in judge(state)._asdict().items() if value}
+
+
+def tilted_by(angle: float):
+    return geometry.quat_from_axis_angle(jnp.array([0.6, 0.8, 0.0]), jnp.float32(angle))
+
+
+def test_a_robot_that_stands_goes_on(causes, robots):
+    for index in range(ROBOTS):
+        assert causes(one(robots, index)) == set()
+
+
+def test_too_much_tilt_ends_it(causes, robots):
+    aloft = put(one(robots), z=1.2)  # where nothing touches
+    assert causes(put(aloft, rotation=tilted_by(1.02))) == {"tilted"}
+    assert causes(put(aloft, rotation=tilted_by(0.98))) == set()
+    assert causes(put(aloft, rotation=tilted_by(3.1))) == {"tilted"}
+
+
+def test_a_pelvis_too_near_to_the_support_ends_it(causes, robots):
+    state = one(robots)
+    z = float(state.body.qpos[2])
+    assert causes(state.replace(support_z=jnp.float32(z - 0.27))) == {"low"}
+    assert causes(state.replace(support_z=jnp.float32(z - 0.29))) == set()
+
+
+def test_a_body_in_the_terrain_ends_it(world, causes, robots):
+    # standing in the middle of a box of 0.4 m, the thighs are in it
+    state = on("platform", one(robots), level=2)
+    line = jnp.stack([jnp.linspace(1.5, 6.0, 451), jnp.zeros(451)], axis=1)
+    heights = np.asarray(terrain.height_at(world.lanes.tile(2, state.kind), line))
+    inside = float(line[np.flatnonzero(heights > 0.39)[50], 0])
+    assert causes(put(state, x=inside)) == {"hit"}
+    assert causes(put(state, x=inside, z=state.body.qpos[2] + 0.4)) == set()
+
+
+def test_a_foot_far_below_the_last_support_ends_it(causes, robots):
+    # a leg is 0.6 m long, so this comes with a low pelvis unless the robot has gone down sideways
+    state = one(robots)
+    ankle = float(state.body.qpos[2]) - 0.55
+    assert causes(state.replace(support_z=jnp.float32(ankle + 0.53))) == {"dropped", "low"}
+    assert causes(state.replace(support_z=jnp.float32(ankle + 0.47))) == {"low"}
+
+
+def test_the_end_of_a_lane_is_a_success_and_open_ground_has_none(world, causes, robots):
+    state = put(one(robots), x=LENGTH - 0.99)
+    assert causes(on("gap", state)) == {"finished"}
+    assert causes(on("flat", state)) == set()
+    assert causes(on("gap", put(state, x=LENGTH - 1.01))) == set()
+
+
+def test_time_runs_out_after_20_s(causes, robots):
+    assert causes(one(robots).replace(step=jnp.int32(1000))) == {"timeout"}
+    assert causes(one(robots).replace(step=jnp.int32(999))) == set()
+
+
+@pytest.mark.parametrize("cause", Ending._fields)
+def test_only_an_end_without_a_failure_truncates(cause):
+    fails = cause not in ("finished", "timeout")
+    over = Ending(*(jnp.array(name == cause) for name in Ending._fields))
+    assert bool(over.terminated) == fails and bool(over.truncated) != fails
+    both = over._replace(timeout=jnp.array(True))
+    assert bool(both.terminated) == fails and bool(both.truncated) != fails
+
+
+# The curriculum
+
+
+@pytest.mark.parametrize(
+    ("walked", "commanded", "level", "cause", "expected"),
+    [
+        (6.1, 9.0, 0, "timeout", 1),  # more than half of the 12 m
+        (5.9, 9.0, 0, "timeout", 0),  # more than half of what was asked for: stays
+        (5.9, 9.0, 1, "timeout", 1),
+        (4.4, 9.0, 1, "timeout", 0),  # less than half of it
+        (0.1, 9.0, 0, "tilted", 0),  # never below the easiest
+        (11.0, 9.0, 1, "tilted", 1),  # far, but fell
+        (1.0, 0.5, 1, "tilted", 1),  # fell early, but had done what was asked
+        (3.0, 9.0, 1, "finished", 2),  # reached the end, however long the lane was
+    ],
+)
+def test_the_next_level(world, robots, walked, commanded, level, cause, expected):
+    state = one(robots).replace(level=jnp.int32(level), commanded=jnp.float32(commanded))
+    state = put(state, x=state.start[0] + walked)
+    over = Ending(*(jnp.array(name == cause) for name in Ending._fields))
+    assert int(episode.next_level(world, state, over, jax.random.key(0))) == expected
+
+
+def test_beyond_the_hardest_level_comes_a_random_one(world, robots):
+    state = one(robots).replace(level=jnp.int32(2), commanded=jnp.float32(9.0))
+    state = put(state, x=state.start[0] + 9.0)
+    over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
+    keys = jax.random.split(jax.random.key(0), 60)
+    levels = jax.vmap(lambda key: episode.next_level(world, state, over, key))(keys)
+    assert sorted(set(np.asarray(levels).tolist())) == [0, 1, 2]
+    fixed = world.replace(config=config.override(C, {"curriculum": {"enabled": False}}))
+    assert int(episode.next_level(fixed, state, over, keys[0])) == 2

@@ -1,0 +1,293 @@
+"""Table I: a number worked by hand for each row, the weights, and how they are summed."""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cref_jax import config, reward, robot
+
+C = config.Reward()
+PERIOD = 0.02  # s
+TABLE_1 = {
+    "linear_velocity_tracking": 2.5,
+    "angular_velocity_tracking": 1.5,
+    "orientation": 1.0,
+    "feet_contact": 1.5,
+    "feet_y_distance": 0.1,
+    "foothold_placement": 2.0,
+    "base_height": 0.8,
+    "linear_velocity_z": -1.0,
+    "angular_velocity_xy": -0.05,
+    "joint_velocity": -1e-3,
+    "action_rate": -0.01,
+    "action_smoothness": -0.01,
+    "feet_air_time": -2.5,
+    "foot_slip": -0.2,
+    "foot_impact_acceleration": -0.5,
+    "foot_impact_velocity": -1.5,
+    "joint_position_limits": -10.0,
+    "joint_velocity_limits": -0.6,
+    "hip_position": -7.0,
+    "ankle_position": -10.0,
+    "stumble": -10.0,
+}
+
+
+@pytest.fixture(scope="module")
+def x2() -> robot.Robot:
+    return robot.load(config.Robot())
+
+
+def perfect(x2: robot.Robot) -> reward.Snapshot:
+    """Stand as Table I wants it: every reward is 1 and every penalty 0."""
+    still = jnp.zeros(3)
+    joints = jnp.zeros(len(x2.joint_names))
+    return reward.Snapshot(
+        velocity=still,
+        angular_velocity=still,
+        gravity=jnp.array([0.0, 0.0, -1.0]),
+        command=still,
+        base_z=jnp.float32(0.55),
+        joint_position=jnp.asarray(x2.nominal_pose),
+        joint_velocity=joints,
+        action=joints,
+        action_1=joints,
+        action_2=joints,
+        foot_z=jnp.zeros(2),
+        feet_y=jnp.float32(0.27),
+        foot_velocity=jnp.zeros((2, 3)),
+        foot_velocity_before=jnp.zeros((2, 3)),
+        foot_force=jnp.array([[0.0, 0.0, 200.0], [0.0, 0.0, 200.0]]),
+        first_contact=jnp.zeros(2, bool),
+        air_time=jnp.full(2, PERIOD),
+        since_single=jnp.float32(9.0),
+        control_period=jnp.float32(PERIOD),
+    )
+
+
+def joints(x2: robot.Robot, start, **changes) -> list[float]:
+    """Return `start`, one number a joint, with the named joints set, rad or rad/s."""
+    values = np.array(np.broadcast_to(start, len(x2.joint_names)), np.float64)
+    for name, value in changes.items():
+        values[x2.joint_names.index(f"{name}_joint")] = value
+    return list(values)
+
+
+def padded(x2: robot.Robot, *values: float) -> list[float]:
+    return [*values, *[0.0] * (len(x2.joint_names) - len(values))]
+
+
+def check(x2: robot.Robot, name: str, expected: float, **changes) -> None:
+    like = perfect(x2)
+    snapshot = like._replace(
+        **{k: jnp.asarray(v, getattr(like, k).dtype) for k, v in changes.items()}
+    )
+    found = reward.TERMS[name](snapshot, C, x2)
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
+
+
+def test_a_row_a_function_and_a_weight_have_one_name():
+    fields = [f.name for f in dataclasses.fields(config.RewardWeights)]
+    assert sorted(reward.TERMS) == sorted(fields)
+    assert set(reward.TERMS) <= set(TABLE_1)
+
+
+def test_the_weights_are_those_of_table_1():
+    weights = dataclasses.asdict(config.RewardWeights())
+    assert weights == {name: TABLE_1[name] for name in weights}
+
+
+def test_linear_velocity_tracking(x2):
+    # e = (0.5, 0.1) - (0.3, -0.1) = (0.2, 0.2); |u| = 0.51 is fast: (0.04 + 0.04) / 0.25 = 0.32
+    check(
+        x2,
+        "linear_velocity_tracking",
+        math.exp(-0.32),
+        command=[0.5, 0.1, 0.7],
+        velocity=[0.3, -0.1, 9.0],
+    )
+    # e = (0.1, 0) - (-0.1, 0.1) = (0.2, -0.1); |u| = 0.1 is slow: (0.2 + 0.1) / 0.25 = 1.2
+    check(
+        x2,
+        "linear_velocity_tracking",
+        math.exp(-1.2),
+        command=[0.1, 0.0, 0.7],
+        velocity=[-0.1, 0.1, 9.0],
+    )
+
+
+def test_angular_velocity_tracking(x2):
+    # (0.3 - 0.8)^2 / 0.25 = 1
+    check(
+        x2,
+        "angular_velocity_tracking",
+        math.exp(-1.0),
+        angular_velocity=[5.0, 5.0, 0.3],
+        command=[0.0, 0.0, 0.8],
+    )
+
+
+def test_orientation(x2):
+    # 10 |(0.03, -0.04)| = 10 * 0.05 = 0.5
+    check(x2, "orientation", math.exp(-0.5), gravity=[0.03, -0.04, -0.99])
+
+
+def test_feet_contact(x2):
+    # |(0.05, 0, 0.05)| = 0.07 < 0.1: standing is always rewarded
+    check(x2, "feet_contact", 1.0, command=[0.05, 0.0, 0.05], since_single=9.0)
+    # turning alone is not standing; one foot alone has touched 0.20 s ago, 0.22 s ago
+    check(x2, "feet_contact", 1.0, command=[0.0, 0.0, 0.2], since_single=0.2)
+    check(x2, "feet_contact", 0.0, command=[0.0, 0.0, 0.2], since_single=0.22)
+
+
+def test_feet_y_distance(x2):
+    # 10 |0.37 - 0.27| = 1
+    check(x2, "feet_y_distance", math.exp(-1.0), feet_y=0.37)
+
+
+def test_base_height(x2):
+    both = [[0.0, 0.0, 50.0], [0.0, 0.0, 20.0]]
+    left = [[0.0, 0.0, 50.0], [0.0, 0.0, 1.0]]  # 1 N does not support: the test is F > 1
+    # both feet: z_supp = (0.1 + 0.3) / 2 = 0.2; 10 |0.85 - 0.2 - 0.55| = 1
+    check(x2, "base_height", math.exp(-1.0), base_z=0.85, foot_z=[0.1, 0.3], foot_force=both)
+    # the left one: z_supp = 0.1; 0.65 - 0.1 = 0.55
+    check(x2, "base_height", 1.0, base_z=0.65, foot_z=[0.1, 0.3], foot_force=left)
+    # none: the lower foot, z_supp = 0.1; 10 |0.55 - 0.1 - 0.55| = 1
+    check(
+        x2,
+        "base_height",
+        math.exp(-1.0),
+        base_z=0.55,
+        foot_z=[0.3, 0.1],
+        foot_force=np.zeros((2, 3)),
+    )
+
+
+def test_linear_velocity_z(x2):
+    # 0.5^2 = 0.25
+    check(x2, "linear_velocity_z", 0.25, velocity=[9.0, 9.0, -0.5])
+
+
+def test_angular_velocity_xy(x2):
+    # 3^2 + 4^2 = 25
+    check(x2, "angular_velocity_xy", 25.0, angular_velocity=[3.0, -4.0, 9.0])
+
+
+def test_joint_velocity(x2):
+    # 1 + 4 + 4 = 9
+    check(x2, "joint_velocity", 9.0, joint_velocity=padded(x2, 1.0, 2.0, -2.0))
+
+
+def test_action_rate(x2):
+    # (1 - -1)^2 + (0 - 0.5)^2 = 4.25
+    check(x2, "action_rate", 4.25, action=padded(x2, 1.0, 0.0), action_1=padded(x2, -1.0, 0.5))
+
+
+def test_action_smoothness(x2):
+    # (1 - 2*2 - 1)^2 + (0 - 2*0.5 + 0)^2 = 16 + 1
+    check(
+        x2,
+        "action_smoothness",
+        17.0,
+        action=padded(x2, 1.0, 0.0),
+        action_1=padded(x2, 2.0, 0.5),
+        action_2=padded(x2, -1.0, 0.0),
+    )
+
+
+def test_feet_air_time(x2):
+    # (0.5 - 0.3) + (0.5 - 0.9) = -0.2; the left foot alone: 0.2; no foot: 0
+    check(x2, "feet_air_time", -0.2, first_contact=[True, True], air_time=[0.3, 0.9])
+    check(x2, "feet_air_time", 0.2, first_contact=[True, False], air_time=[0.3, 0.9])
+    check(x2, "feet_air_time", 0.0, air_time=[0.3, 0.9])
+
+
+def test_foot_slip(x2):
+    # |(0, 3, 4)| = 5 is not above 5; |(0, 0, 6)| is: |(0.1, 0.2, 0.2)| = 0.3
+    check(
+        x2,
+        "foot_slip",
+        0.3,
+        foot_force=[[0.0, 3.0, 4.0], [0.0, 0.0, 6.0]],
+        foot_velocity=[[7.0, 7.0, 7.0], [0.1, 0.2, 0.2]],
+    )
+
+
+def test_foot_impact_acceleration(x2):
+    # |0 - -1.5| / 0.02 - 50 = 25; |0.5 - 0| / 0.02 = 25 is below 50
+    check(
+        x2,
+        "foot_impact_acceleration",
+        25.0,
+        foot_velocity=[[9.0, 9.0, 0.0], [0.0, 0.0, 0.5]],
+        foot_velocity_before=[[0.0, 0.0, -1.5], [0.0, 0.0, 0.0]],
+    )
+
+
+def test_foot_impact_velocity(x2):
+    # |-0.8| - 0.6 = 0.2; 0.5 is below 0.6
+    check(x2, "foot_impact_velocity", 0.2, foot_velocity=[[9.0, 9.0, -0.8], [0.0, 0.0, 0.5]])
+
+
+def test_joint_position_limits(x2):
+    # knee, 0 to 2.4073: middle 1.20365, 95 % of the half is 1.1434675, so 2.3471175 + 0.1 is 0.1
+    # ankle roll, +-0.2967: 95 % is 0.281865, so -0.331865 is 0.05 beyond
+    position = joints(x2, x2.nominal_pose, left_knee=2.4471175, right_ankle_roll=-0.331865)
+    check(x2, "joint_position_limits", 0.15, joint_position=position)
+
+
+def test_joint_velocity_limits(x2):
+    # hip 13.936 - 11.936 = 2; ankle roll |-16.077| - 15.077 = 1; knee 11.9 is within 11.936
+    speed = joints(x2, 0.0, left_hip_pitch=13.936, right_ankle_roll=-16.077, left_knee=11.9)
+    check(x2, "joint_velocity_limits", 3.0, joint_velocity=speed)
+
+
+def test_hip_position(x2):
+    # roll 0.1^2 + yaw 0.2^2 = 0.05; the pitch is free
+    position = joints(
+        x2, x2.nominal_pose, left_hip_roll=0.1, right_hip_yaw=-0.2, left_hip_pitch=0.5
+    )
+    check(x2, "hip_position", 0.05, joint_position=position)
+
+
+def test_ankle_position(x2):
+    # 0.1^2 + 0.2^2 = 0.05; the pitch is free
+    position = joints(
+        x2, x2.nominal_pose, left_ankle_roll=0.1, right_ankle_roll=-0.2, left_ankle_pitch=0.3
+    )
+    check(x2, "ankle_position", 0.05, joint_position=position)
+
+
+def test_stumble(x2):
+    # |(3, 4)| = 5 is above 5 * 0.9 = 4.5 and not above 5 * 1
+    check(x2, "stumble", 1.0, foot_force=[[0.0, 0.0, 9.0], [3.0, 4.0, -0.9]])
+    check(x2, "stumble", 0.0, foot_force=[[0.0, 0.0, 9.0], [3.0, 4.0, 1.0]])
+    check(x2, "stumble", 0.0, foot_force=np.zeros((2, 3)))  # a foot in the air hits nothing
+
+
+def test_a_perfect_stand_has_every_reward_and_no_penalty(x2):
+    _, parts = reward.total(perfect(x2), C, x2)
+    expected = {name: max(weight, 0.0) for name, weight in TABLE_1.items() if name in parts}
+    assert {name: pytest.approx(float(v), abs=1e-6) for name, v in parts.items()} == expected
+
+
+@pytest.mark.parametrize(
+    ("times_dt", "clip_at_zero", "expected"),
+    [(True, True, 0.0), (True, False, -0.032), (False, False, -1.6), (False, True, 0.0)],
+)
+def test_the_sum_is_scaled_by_the_period_and_cut_at_zero(x2, times_dt, clip_at_zero, expected):
+    # 2.5 + 1.5 + 1 + 1.5 + 0.1 + 0.8 = 7.4, less 3^2 is -1.6; in 0.02 s that is -0.032
+    c = dataclasses.replace(C, times_dt=times_dt, clip_at_zero=clip_at_zero)
+    snapshot = perfect(x2)._replace(velocity=jnp.array([0.0, 0.0, 3.0]))
+    found, parts = reward.total(snapshot, c, x2)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert float(parts["linear_velocity_z"]) == -9.0  # the log keeps it, whatever becomes of it
+
+
+def test_a_positive_sum_passes_the_cut(x2):
+    # (7.4 - 2^2) * 0.02 = 0.068
+    found, _ = reward.total(perfect(x2)._replace(velocity=jnp.array([0.0, 0.0, 2.0])), C, x2)
+    np.testing.assert_allclose(found, 0.068, rtol=1e-5)

@@ -1,0 +1,135 @@
+"""The command line of training: what it refuses, what it writes, and that it resumes exactly."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from cref_jax import config, learn, runs, train
+from cref_jax.checkpoint import Checkpoints
+
+TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
+TINY += ["--no-tensorboard", "--no-evaluate"]
+
+
+def run(folder: Path, *more: str) -> None:
+    train.main([*TINY, "--run-dir", str(folder), *more])
+
+
+def state_of(folder: Path) -> list[np.ndarray]:
+    """Return every number of the newest checkpoint."""
+    c = runs.read_config(folder)
+    like = jax.jit(learn.initial_state)(runs.world_of(c))
+    with Checkpoints(folder / "checkpoints") as steps:
+        state, _ = steps.restore(like)
+    plain = lambda x: (
+        jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    )
+    return [np.asarray(plain(x)) for x in jax.tree.leaves(state)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--terrain", "gpa"], "did you mean 'gap'?"),
+        (["--experiment", "smok"], "did you mean 'smoke'?"),
+        (["--num-envs", "0"], "'run.num_envs' must be at least 1, not 0"),
+        (["--num-envs", "510"], "take 508 or 512"),
+        (["--iterations", "-3"], "'run.iterations' must be at least 1"),
+        (["--physics.timestep", "1.0"], "'physics.timestep' must be"),
+        (["--resume", "--run-dir", "nowhere"], "nowhere is not a run"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(
+    arguments: list[str],
+    says: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        train.main(["--device", "cpu", "--ppo.minibatches", "4", *arguments])
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert end.value.code == 2
+    assert len(lines) == 1 and lines[0].startswith("error: ") and says in lines[0]
+    assert not list(tmp_path.iterdir()), "nothing was written"
+
+
+def test_a_gpu_that_is_not_there_is_an_error_that_names_the_way_to_it(
+    capsys: pytest.CaptureFixture[str],
+):
+    if jax.default_backend() == "gpu":
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(SystemExit) as end:
+        train.main(["--device", "gpu"])
+    assert end.value.code == 2
+    assert "pip install 'cref-jax[cuda12]'" in capsys.readouterr().err
+
+
+def test_an_unknown_key_in_an_experiment_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "mine.toml").write_text("[ppo]\nepoch = 3\n")
+    with pytest.raises(SystemExit):
+        train.main(["--experiment", str(tmp_path / "mine.toml")])
+    assert "unknown setting 'ppo.epoch'; did you mean 'ppo.epochs'?" in capsys.readouterr().err
+
+
+def test_settings_come_from_defaults_then_device_then_experiment_then_command_line():
+    _, c = train.parse(["--device", "cpu", "--terrain", "flat", "--experiment", "smoke"])
+    assert c.ppo.gamma == config.PPO().gamma  # the default
+    assert c.run.num_envs == 8  # the experiment's, over the device's
+    _, c = train.parse([*TINY, "--ppo.epochs", "7", "--num-envs", "16"])
+    assert (c.ppo.epochs, c.run.num_envs) == (7, 16)
+
+
+@pytest.mark.slow
+def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path):
+    run(tmp_path / "straight", "--iterations", "4", "--run.chunk", "2")
+    run(tmp_path / "halves", "--iterations", "2")
+    run(tmp_path / "halves", "--iterations", "4", "--resume")
+    straight, halves = state_of(tmp_path / "straight"), state_of(tmp_path / "halves")
+    assert all(np.array_equal(a, b) for a, b in zip(straight, halves, strict=True))
+    log = [json.loads(line) for line in (tmp_path / "halves" / "log.jsonl").open()]
+    assert [line["iteration"] for line in log] == [1, 2, 3, 4]
+    assert len((tmp_path / "halves" / "origin.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_another_number_of_robots_and_keeps_what_it_learned(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run(tmp_path / "run")
+    run(tmp_path / "run", "--iterations", "3", "--num-envs", "4", "--resume")
+    assert "the number of robots changes from 8 to 4" in capsys.readouterr().out
+    with Checkpoints(tmp_path / "run" / "checkpoints") as steps:
+        assert steps.latest() == 3
+
+
+@pytest.mark.slow
+def test_a_run_is_not_overwritten_by_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run(tmp_path / "run")
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path / "run")
+    assert end.value.code == 2 and "add --resume" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_sigterm_saves_what_was_learned(tmp_path: Path):
+    command = [sys.executable, "-m", "cref_jax.train", *TINY, "--iterations", "100000"]
+    folder = tmp_path / "run"
+    with subprocess.Popen([*command, "--run-dir", str(folder)], stdout=subprocess.PIPE) as process:
+        log = folder / "log.jsonl"
+        while process.poll() is None and not (log.exists() and log.stat().st_size):
+            time.sleep(0.2)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=120) == 0
+    with Checkpoints(folder / "checkpoints") as steps:
+        assert steps.latest() == len(log.read_text().splitlines())
