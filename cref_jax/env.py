@@ -62,12 +62,13 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
 
 
 def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[EnvState, Outcome]:
-    """Advance 20 ms: command, push, physics, reward, end of episode, next observation."""
+    """Advance 20 ms: push, physics, reward, end of episode, next command and observation.
+
+    A new command comes after the reward, so the reward is for the command that the policy has seen.
+    """
     c = world.config
     key, key_push, key_command, key_reset, key_see = jax.random.split(state.key, 5)
-    state = episode.commanded(
-        world, episode.pushed(world, state.replace(key=key), key_push), key_command
-    )
+    state = episode.pushed(world, state.replace(key=key), key_push)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
     targets = jnp.stack([_target(world, state, state.action), _target(world, state, action)])
@@ -84,6 +85,7 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
+    lived = episode.commanded(world, lived, key_command)
     last = observe(world, lived, key_see)
 
     done = ending.terminated | ending.truncated

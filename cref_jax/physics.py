@@ -23,6 +23,7 @@ from cref_jax.host_physics import Dynamics, HostEngine, Substep
 with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed
     from mujoco import mjx
 
+MAX_DEPTH = 0.02  # m; assumed: twice a sole's sphere, deeper than any contact below 4 m/s
 EngineName = Literal["auto", "mjx", "mujoco"]
 
 
@@ -93,10 +94,15 @@ class Physics:
     def planes(
         self, ground: terrain.Terrain, body: Body
     ) -> tuple[Float[Array, "P 3"], Float[Array, "P 4"]]:
-        """Return position and rotation of the terrain's tangent plane under each sphere."""
+        """Return position and rotation of the terrain's tangent plane under each sphere.
+
+        A plane is never more than `MAX_DEPTH` above its sphere's centre: a sphere that was thrown
+        deep into a wall comes out at the speed of a collision and not of an explosion.
+        """
         spheres = self.robot.spheres
         centres = kinematics.points(self.links(body), spheres.body, spheres.position)
-        point, normal, _ = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
+        _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
+        point = centres - normal * jnp.maximum(distance, -MAX_DEPTH)[:, None]
         return point, jax.vmap(geometry.quat_from_z)(normal)
 
     def is_hit(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, ""]:

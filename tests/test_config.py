@@ -1,0 +1,66 @@
+"""Settings are found by name, of the right type, and refused in words that help."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from cref_jax import config
+from cref_jax.config import Config, ConfigError
+
+SOURCE = Path(config.__file__).read_text()
+
+
+def test_changes_reach_nested_settings_and_leave_the_rest():
+    c = config.override(Config(), {"ppo": {"epochs": 2}, "reward": {"weights": {"stumble": -1.0}}})
+    assert (c.ppo.epochs, c.reward.weights.stumble) == (2, -1.0)
+    assert dataclasses.replace(c, ppo=config.PPO(), reward=config.Reward()) == Config()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"pqo": {}}, "unknown setting 'pqo'; did you mean 'ppo'?"),
+        ({"ppo": {"epoch": 1}}, "unknown setting 'ppo.epoch'; did you mean 'ppo.epochs'?"),
+        ({"ppo": 3}, "'ppo' is a table of settings, not 3"),
+        ({"ppo": {"epochs": "3"}}, "'ppo.epochs' must be int, not '3'"),
+        ({"ppo": {"epochs": True}}, "'ppo.epochs' must be int, not True"),
+        ({"command": {"vx": [0.1]}}, "'command.vx' takes 2 values, not 1"),
+        ({"command": {"vx": 0.1}}, "'command.vx' must be a list, not 0.1"),
+        ({"robot": {"actuated": "arms"}}, "'robot.actuated' must be one of 'legs'"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_by_name(changes: dict, says: str):
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        config.override(Config(), changes)
+
+
+def test_a_whole_number_may_stand_for_a_real_one():
+    assert config.override(Config(), {"ppo": {"clip": 1}}).ppo.clip == 1.0
+
+
+def test_settings_survive_json():
+    stored = json.loads(json.dumps(dataclasses.asdict(Config())))
+    assert config.override(Config(), stored) == Config()
+
+
+def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match="no file"):
+        config.load_toml(tmp_path / "none.toml")
+    (tmp_path / "broken.toml").write_text("a = ")
+    with pytest.raises(ConfigError, match=r"broken\.toml"):
+        config.load_toml(tmp_path / "broken.toml")
+
+
+def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
+    few = config.override(Config(), {"run": {"num_envs": 3}, "ppo": {"minibatches": 4}})
+    with pytest.raises(ConfigError, match="take 4"):
+        config.check(few)
+    config.check(Config())
+
+
+def test_the_horizon_is_half_a_second_and_a_control_step_20_ms():
+    assert Config().physics.control_period == pytest.approx(0.020)  # Sec. II-D: 50 Hz
+    assert Config().run.num_envs == 4096 and Config().run.iterations == 20_000  # Sec. II-D

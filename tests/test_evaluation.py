@@ -1,0 +1,64 @@
+"""How episodes are counted, with outcomes that are known beforehand."""
+
+import numpy as np
+import pytest
+
+from cref_jax import evaluation
+from cref_jax.config import Config
+from cref_jax.episode import Ending
+from cref_jax.evaluation import _judged, _Step
+
+
+def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _Step:
+    return _Step(
+        alive=alive,
+        forward_error=np.full(alive.shape, error, np.float32),
+        tracking_error=np.full(alive.shape, abs(error), np.float32),
+        airborne=airborne,
+    )
+
+
+def ending(episodes: int, **flags: list[bool]) -> Ending:
+    none = np.zeros(episodes, bool)
+    return Ending(**{name: np.array(flags.get(name, none)) for name in Ending._fields})
+
+
+def test_two_of_three_robots_that_fall_are_counted_by_cause():
+    alive = np.ones((4, 3), bool)
+    end = ending(3, tilted=[True, False, False], low=[False, True, False])
+    walk = _judged(end, trace(alive, 0.1, np.zeros((4, 3, 2), bool)), Config())
+    assert (walk.episodes, walk.fell) == (3, 2)
+    assert walk.by_cause == {"tilted": 1, "low": 1, "hit": 0, "dropped": 0, "unstable": 0}
+
+
+def test_what_comes_after_a_fall_does_not_count():
+    # robot 0 lives 2 of 4 steps with an error of 0.2 and would have 9 afterwards; robot 1 has 0.4
+    alive = np.array([[1, 1], [1, 1], [0, 1], [0, 1]], bool)
+    seen = trace(alive, 0.0, np.zeros((4, 2, 2), bool))
+    error = np.array([[0.2, 0.4], [0.2, 0.4], [9.0, 0.4], [9.0, 0.4]], np.float32)
+    walk = _judged(ending(2), seen._replace(forward_error=error), Config())
+    assert walk.speed_error == pytest.approx(0.3)  # (0.2 + 0.4) / 2
+
+
+def test_speed_that_errs_both_ways_alike_is_right_on_the_whole():
+    alive = np.ones((4, 1), bool)
+    seen = trace(alive, 0.0, np.zeros((4, 1, 2), bool))
+    error = np.array([[0.2], [-0.2], [0.2], [-0.2]], np.float32)
+    walk = _judged(ending(1), seen._replace(forward_error=error), Config())
+    assert walk.speed_error == pytest.approx(0.0, abs=1e-6)
+
+
+def test_share_in_the_air_and_length_of_a_stride():
+    # left foot: 10 steps up, 10 down, over 40 steps of 20 ms: half the time, a stride of 0.4 s
+    up = np.tile(np.repeat([True, False], 10), 2)
+    airborne = np.stack([up, ~up], axis=-1)[:, None]  # the right foot alternates with it
+    walk = _judged(ending(1), trace(np.ones((40, 1), bool), 0.0, airborne), Config())
+    assert walk.airborne == (0.5, 0.5)
+    # touchdowns seen: left at 10 and 30, right at 20; 40 steps x 2 feet x 0.02 s / 3 = 0.533 s
+    assert walk.step_seconds == pytest.approx(1.6 / 3)
+
+
+def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
+    c = evaluation.evaluation_config(Config())
+    assert not c.randomisation.enabled and not c.curriculum.enabled
+    assert c.command.lane_vx == (0.4, 0.8) and c.command.open_kinds == ()
