@@ -31,10 +31,10 @@ bench: $(READY)  ## measure steps a second on this machine
 	$(BIN)/python -m cref_jax.bench $(ARGS)
 
 test: $(READY)  ## run every test: ARGS="-k depth"
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 test-fast: $(READY)  ## run the tests that take seconds
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow" $(ARGS)
 
 check: $(READY)  ## format, lint and types, without changing a file
 	$(BIN)/ruff format --check .

@@ -255,7 +255,7 @@ def override(config: C, changes: dict[str, Any], where: str = "") -> C:
     for key, value in changes.items():
         path = f"{where}{key}"
         if key not in hints:
-            raise ConfigError(unknown("setting", path, [where + hint for hint in hints]))
+            raise ConfigError(unknown("setting", key, list(hints), where))
         if dataclasses.is_dataclass(hints[key]):
             if not isinstance(value, dict):
                 raise ConfigError(f"'{path}' is a table of settings, not {value!r}")
@@ -265,11 +265,14 @@ def override(config: C, changes: dict[str, Any], where: str = "") -> C:
     return dataclasses.replace(config, **values)  # type: ignore[type-var]
 
 
-def unknown(what: str, name: str, known: list[str]) -> str:
-    """Return the message for a name that does not exist: the nearest one, or all that do."""
+def unknown(what: str, name: str, known: list[str], where: str = "") -> str:
+    """Return the message for a name that does not exist: the nearest one, or all that do.
+
+    `where` is what stands before the name, such as the tables that a setting is in.
+    """
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
-    return f"unknown {what} '{name}'; {hint}"
+    return f"unknown {what} '{where}{name}'; {hint}"
 
 
 def check(c: Config) -> None:

@@ -79,7 +79,7 @@ def test_an_unknown_key_in_an_experiment_is_named(
     (tmp_path / "mine.toml").write_text("[ppo]\nepoch = 3\n")
     with pytest.raises(SystemExit):
         train.main(["--experiment", str(tmp_path / "mine.toml")])
-    assert "unknown setting 'ppo.epoch'; did you mean 'ppo.epochs'?" in capsys.readouterr().err
+    assert "unknown setting 'ppo.epoch'; did you mean 'epochs'?" in capsys.readouterr().err
 
 
 def test_settings_come_from_defaults_then_device_then_experiment_then_command_line():
