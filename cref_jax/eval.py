@@ -8,6 +8,7 @@ from typing import Literal
 import tyro
 
 from cref_jax import cli, evaluation, runs
+from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 
 
@@ -36,6 +37,8 @@ def main() -> None:
     options = tyro.cli(Options, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
         cli.use_compile_cache()
+        if options.num_envs < 1:
+            raise ConfigError(f"--num-envs must be at least 1, not {options.num_envs}")
         run = options.run or runs.newest()
         world = runs.world_of(runs.read_config(run), options.engine)
         policy = runs.load_policy(run, world)

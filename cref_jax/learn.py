@@ -57,7 +57,7 @@ def _iteration(world: World, state: RunState, key: Array) -> tuple[RunState, Log
     robots, experience, trace = rollout.collect(world, nets, state.train, state.robots, key_act)
     train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets)
     log = {
-        **_episodes(trace, world.lanes.kinds),
+        **_episodes(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
@@ -67,16 +67,19 @@ def _iteration(world: World, state: RunState, key: Array) -> tuple[RunState, Log
     return RunState(train, robots), log
 
 
-def _episodes(trace: rollout.Trace, kinds: tuple[str, ...]) -> Log:
-    """Return how the robots walk, and how the episodes that ended did, by kind of terrain."""
+def _episodes(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:
+    """Return how the robots walk, and how the episodes that ended did, by kind of terrain.
+
+    `period` is the length of a control step, s.
+    """
     ending, measures = trace.ending, trace.measures
     over = ending.terminated | ending.truncated
     among = lambda x, which: jnp.sum(x * which) / jnp.maximum(which.sum(), 1)
-    period = 1.0 / 50.0
     log = {
         "episode/length_s": among(measures.steps * period, over),
         "episode/ended": over.sum().astype(jnp.float32),
         "episode/fell": ending.terminated.sum().astype(jnp.float32),
+        "episode/falls_per_minute": ending.terminated.mean() * (60.0 / period),
         "episode/unstable": ending.unstable.sum().astype(jnp.float32),
         "walk/speed_error": measures.speed_error.mean(),
         "walk/forward_speed": measures.forward_speed.mean(),

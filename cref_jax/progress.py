@@ -18,7 +18,7 @@ SHOWN = {  # name in the log: name on the screen and unit
     "walk/speed_error": ("speed error", "m/s"),
     "walk/forward_speed": ("forward speed", "m/s"),
     "episode/length_s": ("episode length", "s"),
-    "episode/falls_per_minute": ("falls", "a robot and minute"),
+    "episode/falls_per_minute": ("falls", "a minute"),
     "walk/reward": ("reward", "a step"),
     "train/action_std": ("action deviation", ""),
     "loss/kl": ("KL", "nats"),
@@ -94,13 +94,13 @@ class Reporter:
         elif time.monotonic() - self._said > PLAIN_SECONDS or iteration >= self._last:
             self._said = time.monotonic()
             task = self._bar.tasks[0]
-            left = f"{task.time_remaining / 60:.0f} min left" if task.time_remaining else ""
+            left = f", {task.time_remaining / 60:.0f} min left" if task.time_remaining else ""
             figures = ", ".join(
                 f"{title} {newest[name]:.3g}{' ' + unit if unit else ''}"
                 for name, (title, unit) in SHOWN.items()
                 if name in newest
             )
-            self.say(f"{iteration}/{self._last}: {rate:,.0f} samples/s, {left}; {figures}")
+            self.say(f"{iteration}/{self._last}: {rate:,.0f} samples/s{left}; {figures}")
 
 
 def _table(newest: Mapping[str, float]) -> Table:
