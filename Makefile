@@ -11,7 +11,7 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
-.PHONY: help setup train eval play bench test test-fast check format clean
+.PHONY: help setup train eval play bench params test test-fast check format clean
 
 help:
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -29,6 +29,9 @@ play: $(READY)  ## watch a policy: ARGS="--run runs/NAME"
 
 bench: $(READY)  ## measure steps a second on this machine
 	$(BIN)/python -m cref_jax.bench $(ARGS)
+
+params: $(READY)  ## count the parameters of each variant of the network
+	$(BIN)/python -m cref_jax.params $(ARGS)
 
 test: $(READY)  ## run every test: ARGS="-k depth"
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)

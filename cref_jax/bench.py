@@ -57,6 +57,7 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.bench")
     with cli.one_line_errors(options.debug):
+        cli.prepare()
         rows = measure(options)
         show(options, rows)
         if options.out:
@@ -211,7 +212,7 @@ def _update(world: World, state: learn.RunState) -> Any:
     collect = functools.partial(rollout.collect, dataclasses.replace(world, config=c), nets)
     shapes = jax.eval_shape(collect, state.train, state.robots, jax.random.key(0))[1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets)
+    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets.functions)
 
 
 if __name__ == "__main__":

@@ -33,10 +33,28 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         sys.exit(1 if isinstance(error, TrainingError) else 2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        sys.exit(130)
+        sys.stdout.flush()
+        os._exit(130)  # at once: a running program may call into this interpreter until its end
 
 
-def use_compile_cache() -> None:
+def prepare() -> None:
+    """Set JAX up, before it is used for the first time."""
+    _use_wide_registers()
+    _use_compile_cache()
+
+
+def _use_wide_registers() -> None:
+    """Let XLA use 512 bits where the CPU has them: an update takes an eighth less time."""
+    try:
+        wide = "avx512f" in Path("/proc/cpuinfo").read_text()
+    except OSError:
+        wide = False
+    flags = os.environ.get("XLA_FLAGS", "")
+    if wide and "xla_cpu_prefer_vector_width" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()
+
+
+def _use_compile_cache() -> None:
     """Keep compiled programs in the user's own cache; it holds code, and so is private."""
     home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     folder = home / "cref_jax" / "xla"

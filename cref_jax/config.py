@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 C = TypeVar("C")
+Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind"]
 
 
 class ConfigError(ValueError):
@@ -56,6 +57,8 @@ class RewardWeights:
     orientation: float = 1.0
     feet_contact: float = 1.5
     feet_y_distance: float = 0.1
+    foothold_placement: float = 2.0
+    foot_contact_quality: float = 0.0  # BeamDojo's term, in place of foothold_placement
     base_height: float = 0.8
     linear_velocity_z: float = -1.0
     angular_velocity_xy: float = -0.05
@@ -86,6 +89,7 @@ class Reward:
     standing: float = 0.1  # u_s; assumed: between 0.05 and 0.1 in published code
     single_contact_window: float = 0.2  # s, Table I
     feet_y_target: float = 0.27  # m, Table I
+    foothold_tolerance: float = 0.08  # m, s_xz; assumed: the one published reimplementation
     base_height_target: float = 0.55  # m above the ankle-roll frames, Table I
     support_force: float = 1.0  # N, Eq. 5
     contact_force: float = 5.0  # N, Table I (foot slip)
@@ -129,6 +133,8 @@ class Randomisation:
     noise_gravity: float = 0.05  # +-
     noise_joint_position: float = 0.01  # rad, +-
     noise_joint_velocity: float = 1.5  # rad/s, +-
+    camera_pitch: float = 2.0  # deg, +-, how the camera is mounted
+    camera_position: float = 0.01  # m, +-, each axis
 
 
 @dataclass(frozen=True)
@@ -169,6 +175,7 @@ class Curriculum:
     up: float = 0.5  # of the lane walked: one level harder
     down: float = 0.5  # less than this share of the commanded distance: one level easier
     start_level: int = 2  # highest level at the start
+    review: float = 0.25  # share of episodes on a lower level, so that none is forgotten
 
 
 @dataclass(frozen=True)
@@ -182,11 +189,45 @@ class Scan:
 
 
 @dataclass(frozen=True)
+class Camera:
+    """The depth camera, a RealSense D435i looking down at the ground ahead (Sec. III-A)."""
+
+    shape: tuple[int, int] = (48, 64)  # rows, columns, Sec. II-D
+    view: tuple[float, float] = (58.0, 87.0)  # deg, vertical, horizontal; D435i data sheet
+    d_max: float = 3.0  # m, Sec. II-B; assumed: published work clips at 2 to 3 m
+    pitch: float = 50.0  # deg below the horizontal, Sec. III-A
+    rate: float = 20.0  # 1/s, Sec. II-D
+
+
+@dataclass(frozen=True)
+class Foothold:
+    """The foothold placement reward (Sec. II-C), and the contact quality it is compared with."""
+
+    points: tuple[int, int] = (60, 5)  # samples forward, across, Sec. II-C
+    spacing: tuple[float, float] = (0.02, 0.025)  # m; assumed: window and stride are whole numbers
+    window: tuple[int, int] = (12, 5)  # samples: 24 cm x 10 cm, Sec. II-C
+    stride: int = 2  # samples: 4 cm, Sec. II-C
+    gate_time: float = 0.5  # s of commanded travel, Sec. II-C
+    roughness: float = 0.010  # m, r_th; assumed: refuses windows with an edge of 5 cm in them
+    verticality: float = 0.9  # eta_th; assumed: slopes up to 0.4 pass, windows over a riser do not
+    min_height: float = -0.5  # m, h_min; assumed: two 23 cm treads down pass, a gap's floor not
+    quality_x: tuple[float, float, int] = (-0.06, 0.13, 5)  # m from, m to, samples of the sole
+    quality_y: tuple[float, float, int] = (-0.05, 0.05, 3)  # m from, m to, samples of the sole
+    quality_depth: float = -0.03  # m under the sole, epsilon of the contact quality; assumed:
+    # BeamDojo's -0.1 is an absolute height, and stairs have no level to measure it from
+
+
+@dataclass(frozen=True)
 class Network:
     """Widths of the actor (Sec. II-B) and of the critic. assumed: the paper gives none."""
 
-    variant: Literal["blind"] = "blind"
+    variant: Variant = "full"
+    convolutions: tuple[tuple[int, int, int], ...] = ((32, 4, 4), (64, 3, 2))
+    # of the depth tokenizer: channels, kernel, stride; 48 x 64 pixels to 6 x 8 tokens, in a third
+    # less time an update than three 3 x 3 filters of stride 2 on a CPU
     token: int = 128  # d
+    heads: int = 4  # of the cross attention
+    compressed: int = 32  # C_psi(D)
     lstm: int = 256  # velocity estimator
     gru: int = 256  # recurrent fusion
     actor: tuple[int, ...] = (512, 256, 128)  # action head
@@ -240,6 +281,8 @@ class Config:
     randomisation: Randomisation = field(default_factory=Randomisation)
     reward: Reward = field(default_factory=Reward)
     scan: Scan = field(default_factory=Scan)
+    camera: Camera = field(default_factory=Camera)
+    foothold: Foothold = field(default_factory=Foothold)
     network: Network = field(default_factory=Network)
     ppo: PPO = field(default_factory=PPO)
 

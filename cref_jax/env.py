@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import config, episode, geometry, observation, reward, terrain
+from cref_jax import config, depth, episode, foothold, geometry, observation, reward, terrain
 from cref_jax.episode import Ending, EnvState
 from cref_jax.kinematics import Links
 from cref_jax.observation import Observation
@@ -26,11 +26,14 @@ class Measures(NamedTuple):
     forward_speed: Float[Array, ""]  # m/s, body frame
     forward_command: Float[Array, ""]  # m/s
     airborne: Bool[Array, " F"]  # the foot is off the ground
+    touchdown: Bool[Array, " F"]
+    foothold_distance: Float[Array, " F"]  # m, from the nearest candidate; inf where there is none
     progress: Float[Array, ""]  # m from the start along the lane
     commanded: Float[Array, ""]  # m asked for
     steps: Int[Array, ""]  # control steps in the episode, this one included
     kind: Int[Array, ""]
     level: Int[Array, ""]
+    rank: Int[Array, ""]
 
 
 class Outcome(NamedTuple):
@@ -67,7 +70,7 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     A new command comes after the reward, so the reward is for the command that the policy has seen.
     """
     c = world.config
-    key, key_push, key_command, key_reset, key_see = jax.random.split(state.key, 5)
+    key, key_push, key_command, key_level, key_reset, key_see = jax.random.split(state.key, 6)
     state = episode.pushed(world, state.replace(key=key), key_push)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
@@ -81,7 +84,7 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
 
     links = world.physics.links(body)
     snapshot = _snapshot(world, state, body, links, force, action)
-    lived = _lived(state, body, snapshot, c.reward)
+    lived = _lived(world, state, body, links, snapshot)
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
@@ -89,13 +92,25 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     last = observe(world, lived, key_see)
 
     done = ending.terminated | ending.truncated
-    level = episode.next_level(world, lived, ending, key_reset)
-    fresh = episode.reset(world, key_reset, lived.kind, level)
+    rank, level = episode.promoted(world, lived, ending, key_level)
+    fresh = episode.reset(world, key_reset, lived.kind, level).replace(rank=rank)
     following = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, lived)
     first = observe(world, fresh, key_see)
     seen = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, last)
     gained = jnp.where(unstable, 0.0, gained)
     return following, Outcome(seen, last.privileged, gained, ending, measures)
+
+
+def depth_image(world: World, state: EnvState) -> Float[Array, "H W"]:
+    """Return D, what the camera sees of the ground and of the robot's own links, normalised."""
+    robot, camera = world.physics.robot, world.config.camera
+    links = world.physics.links(state.body)
+    position, rotation = depth.pose(
+        links, robot.camera, camera, state.camera_pitch, state.camera_shift
+    )
+    capsules = depth.capsules_in_view(links, robot.capsules)
+    metres = depth.render(_ground(world, state), position, rotation, capsules, camera)
+    return depth.normalise(metres, camera)
 
 
 def _ground(world: World, state: EnvState) -> terrain.Terrain:
@@ -129,6 +144,7 @@ def _snapshot(
     single = touching[0] ^ touching[1]
     now = observation.motion(body.qpos, body.qvel)
     across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
+    soles = foothold.soles(links, world.physics.robot)
     return reward.Snapshot(
         velocity=now.velocity,
         angular_velocity=now.angular_velocity,
@@ -147,15 +163,22 @@ def _snapshot(
         foot_force=force,
         first_contact=touching & (state.air_time > 0.0),
         air_time=state.air_time + period,
+        foothold_distance=foothold.distance(state.candidates, soles.centre),
+        unsupported=foothold.unsupported(_ground(world, state), soles, c.foothold),
         since_single=jnp.where(single, 0.0, state.since_single + period),
         control_period=jnp.float32(period),
     )
 
 
-def _lived(state: EnvState, body: Body, s: reward.Snapshot, c: config.Reward) -> EnvState:
+def _lived(world: World, state: EnvState, body: Body, links: Links, s: reward.Snapshot) -> EnvState:
     """Return the state after the step, if the episode goes on."""
-    touching = reward.is_touching(s.foot_force, c)
-    support = reward.support_height(s.foot_z, s.foot_force, c)
+    c = world.config
+    touching = reward.is_touching(s.foot_force, c.reward)
+    support = reward.support_height(s.foot_z, s.foot_force, c.reward)
+    soles = foothold.soles(links, world.physics.robot)
+    ahead = foothold.candidates(
+        _ground(world, state), soles.centre, soles.heading, state.command[0], c.foothold
+    )
     return state.replace(
         body=body,
         action=s.action,
@@ -164,6 +187,7 @@ def _lived(state: EnvState, body: Body, s: reward.Snapshot, c: config.Reward) ->
         air_time=jnp.where(touching, 0.0, s.air_time),
         since_single=s.since_single,
         support_z=jnp.where(touching.any(), support, state.support_z),
+        candidates=foothold.updated(state.candidates, ahead, ~touching & (state.air_time == 0.0)),
         step=state.step + 1,
     )
 
@@ -179,9 +203,12 @@ def _measures(
         forward_speed=s.velocity[0],
         forward_command=s.command[0],
         airborne=state.air_time > 0.0,
+        touchdown=s.first_contact,
+        foothold_distance=s.foothold_distance,
         progress=state.body.qpos[0] - state.start[0],
         commanded=state.commanded,
         steps=state.step,
         kind=state.kind,
         level=state.level,
+        rank=state.rank,
     )

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import config, geometry
+from cref_jax import config, foothold, geometry
+from cref_jax.foothold import Candidates
 from cref_jax.host_physics import Dynamics
 from cref_jax.kinematics import Links
 from cref_jax.physics import Body
@@ -29,7 +30,8 @@ class EnvState:
     joint_offset: Float[Array, " J"]  # rad, encoder zero
     delay: Int[Array, ""]  # substeps until a new target arrives
     kind: Int[Array, ""]  # of terrain
-    level: Int[Array, ""]  # of difficulty
+    level: Int[Array, ""]  # of difficulty, of the lane that it is on
+    rank: Int[Array, ""]  # the hardest level that it has earned
     start: Float[Array, "2"]  # m, where the episode began
     command: Float[Array, "3"]  # m/s, m/s, rad/s
     command_left: Int[Array, ""]  # control steps until the next draw
@@ -41,6 +43,9 @@ class EnvState:
     air_time: Float[Array, " F"]  # s since each foot touched
     since_single: Float[Array, ""]  # s since one foot alone touched
     support_z: Float[Array, ""]  # m, height of the last support
+    candidates: Candidates  # where each foot may step, since its last liftoff
+    camera_pitch: Float[Array, ""]  # rad, error of the camera's mount
+    camera_shift: Float[Array, "3"]  # m, error of the camera's mount
     step: Int[Array, ""]  # control steps into the episode
 
 
@@ -69,10 +74,11 @@ class Ending(NamedTuple):
 def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Array, ""]) -> EnvState:
     """Return a robot at the start of a lane of that kind and level."""
     c = world.config
-    keys = jax.random.split(key, 8)
+    keys = jax.random.split(key, 7)
     joints = len(world.physics.robot.joint_names)
     body = _placed(world, keys[0])
     dynamics, offset, delay = _drawn_dynamics(world, keys[1])
+    pitch, shift = _drawn_mount(c.randomisation, keys[6])
     return EnvState(
         key=keys[2],
         body=body,
@@ -81,6 +87,7 @@ def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Arra
         delay=delay,
         kind=kind,
         level=level,
+        rank=level,
         start=body.qpos[:2],
         command=_drawn_command(world, keys[3], kind),
         command_left=_drawn_steps(c, keys[4], c.command.period),
@@ -92,6 +99,9 @@ def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Arra
         air_time=jnp.zeros(2),
         since_single=jnp.zeros(()),
         support_z=body.qpos[2] - c.reward.base_height_target,
+        candidates=foothold.none(c.foothold),
+        camera_pitch=pitch,
+        camera_shift=shift,
         step=jnp.zeros((), jnp.int32),
     )
 
@@ -152,20 +162,26 @@ def ending(world: World, state: EnvState, links: Links, unstable: Bool[Array, ""
     )
 
 
-def next_level(world: World, state: EnvState, over: Ending, key: PRNGKeyArray) -> Int[Array, ""]:
-    """Return the level of the next episode: harder after a good one, easier after a poor one.
+def promoted(
+    world: World, state: EnvState, over: Ending, key: PRNGKeyArray
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Return the rank after an episode, and the level of the next.
 
-    Beyond the hardest level a random one follows.
+    A good episode on the level of its rank earns the robot the next one, a poor one costs it this
+    one. Most episodes are on that level; some, and all after the hardest one has been passed, are
+    on any level up to it, since a robot forgets what it no longer meets.
     """
-    c = world.config
-    if not c.curriculum.enabled:
-        return state.level
+    c, top = world.config.curriculum, world.lanes.levels - 1
+    if not c.enabled:
+        return state.rank, state.level
     walked = state.body.qpos[0] - state.start[0]
-    up = ~over.terminated & (over.finished | (walked > c.curriculum.up * world.lanes.length))
-    down = ~up & (walked < c.curriculum.down * state.commanded)
-    level = jnp.maximum(state.level + up.astype(jnp.int32) - down.astype(jnp.int32), 0)
-    anew = jax.random.randint(key, (), 0, world.lanes.levels)
-    return jnp.where(level >= world.lanes.levels, anew, level)
+    up = ~over.terminated & (over.finished | (walked > c.up * world.lanes.length))
+    down = ~up & (walked < c.down * state.commanded)
+    earned = state.rank + (up.astype(jnp.int32) - down) * (state.level == state.rank)
+    rank = jnp.clip(earned, 0, top)
+    key_review, key_level = jax.random.split(key)
+    review = (earned > top) | (jax.random.uniform(key_review) < c.review)
+    return rank, jnp.where(review, jax.random.randint(key_level, (), 0, rank + 1), rank)
 
 
 def _placed(world: World, key: PRNGKeyArray) -> Body:
@@ -210,6 +226,20 @@ def _drawn_dynamics(
         dynamics,
         draw(keys[5], joints, -c.joint_offset, c.joint_offset),
         jax.random.randint(keys[6], (), 0, most + 1),
+    )
+
+
+def _drawn_mount(
+    c: config.Randomisation, key: PRNGKeyArray
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """Draw the errors of the camera's mount: pitch, rad, and position, m."""
+    if not c.enabled:
+        return jnp.zeros(()), jnp.zeros(3)
+    key_pitch, key_shift = jax.random.split(key)
+    pitch = np.deg2rad(c.camera_pitch)
+    return (
+        jax.random.uniform(key_pitch, (), minval=-pitch, maxval=pitch),
+        jax.random.uniform(key_shift, (3,), minval=-c.camera_position, maxval=c.camera_position),
     )
 
 

@@ -18,10 +18,15 @@ class Options:
 
     run: Path | None = None
     """runs/NAME; the newest one when left out"""
-    suite: Literal["walk"] = "walk"
-    """walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s"""
-    num_envs: int = 100
-    """episodes"""
+    suite: Literal["walk", "cross"] = "walk"
+    """walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; cross: trials of up to 40 s on a
+    lane with obstacles of one size"""
+    kind: str = "gap"
+    """of the obstacles to cross: gap, stairs_up, stairs_down, platform, rough, slope"""
+    size: float = 0.3
+    """of the obstacles to cross, m"""
+    num_envs: int = 200
+    """episodes or trials"""
     seed: int = 0
     """of the first states and commands"""
     engine: EngineName = "auto"
@@ -36,15 +41,19 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
-        cli.use_compile_cache()
+        cli.prepare()
         if options.num_envs < 1:
             raise ConfigError(f"--num-envs must be at least 1, not {options.num_envs}")
         run = options.run or runs.newest()
         world = runs.world_of(runs.read_config(run), options.engine)
         policy = runs.load_policy(run, world)
-        result = evaluation.walk(
-            policy.config, world.physics, policy.train, options.num_envs, options.seed
-        )
+        c, train = policy.config, policy.train
+        if options.suite == "walk":
+            result = evaluation.walk(c, world.physics, train, options.num_envs, options.seed)
+        else:
+            result = evaluation.cross(
+                c, world.physics, train, options.kind, options.size, options.num_envs, options.seed
+            )
         print(f"{run}, iteration {policy.iteration}: {result.line()}")
         out = options.out or run
         out.mkdir(parents=True, exist_ok=True)

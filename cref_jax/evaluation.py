@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cref_jax import ppo, rollout
+from cref_jax import lanes, ppo, rollout
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
@@ -16,6 +16,7 @@ from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # of an episode on flat ground; assumed
+CROSSING_SECONDS = 40.0  # of a trial on a lane, Sec. III-A
 WALK_SEED = 1_000_003  # apart from the seeds of training
 
 
@@ -38,6 +39,25 @@ class Walk(NamedTuple):
             f"speed error {self.speed_error:.3f} m/s, "
             f"feet off the ground {left:.0%} and {right:.0%} of the time, "
             f"{self.step_seconds:.2f} s a stride"
+        )
+
+
+class Crossing(NamedTuple):
+    """The outcome of E trials on one kind of lane with obstacles of one size."""
+
+    kind: str
+    size_m: float
+    trials: int
+    successes: int  # came to the lane's end in time
+    by_cause: dict[str, int]  # of the failures; timeout: it stood, or was too slow
+    seconds: float  # mean time of a success
+
+    def line(self) -> str:
+        """Return the outcome in one line for people."""
+        causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
+        return (
+            f"{self.kind} {100 * self.size_m:.0f} cm: {self.successes} of {self.trials} trials "
+            f"crossed, {self.seconds:.1f} s each" + (f"; failures: {causes}" if causes else "")
         )
 
 
@@ -73,6 +93,34 @@ def walk(
     key = jax.random.key(WALK_SEED + seed)
     ending, trace = _episodes(world, train, key, episodes, steps)
     return _judged(jax.tree.map(np.asarray, ending), jax.tree.map(np.asarray, trace), c)
+
+
+def cross(
+    c: Config,
+    physics: Physics,
+    train: ppo.TrainState,
+    kind: str,
+    size: float,
+    trials: int = 200,
+    seed: int = 0,
+) -> Crossing:
+    """Return how often the policy's mean action comes to the end of a lane with such obstacles."""
+    c = evaluation_config(c, CROSSING_SECONDS)
+    world = make_world(c, physics).replace(lanes=lanes.single(c.terrain, kind, size))
+    steps = round(CROSSING_SECONDS / c.physics.control_period)
+    key = jax.random.key(WALK_SEED + seed)
+    ending, trace = jax.tree.map(np.asarray, _episodes(world, train, key, trials, steps))
+    done = ending.finished & ~ending.terminated
+    seconds = trace.alive.sum(axis=0) * c.physics.control_period
+    failures = {**ending._asdict(), "timeout": ~done & ~ending.terminated}
+    return Crossing(
+        kind=kind,
+        size_m=size,
+        trials=trials,
+        successes=int(done.sum()),
+        by_cause={n: int(f.sum()) for n, f in failures.items() if n != "finished"},
+        seconds=float(seconds[done].mean()) if done.any() else float("nan"),
+    )
 
 
 @jax.jit(static_argnames=("episodes", "steps"))

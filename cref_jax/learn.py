@@ -55,7 +55,7 @@ def _iteration(world: World, state: RunState, key: Array) -> tuple[RunState, Log
     nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
     key_act, key_update = jax.random.split(key)
     robots, experience, trace = rollout.collect(world, nets, state.train, state.robots, key_act)
-    train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets)
+    train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions)
     log = {
         **_episodes(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
@@ -75,6 +75,8 @@ def _episodes(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Lo
     ending, measures = trace.ending, trace.measures
     over = ending.terminated | ending.truncated
     among = lambda x, which: jnp.sum(x * which) / jnp.maximum(which.sum(), 1)
+    distance = measures.foothold_distance
+    placed = measures.touchdown & jnp.isfinite(distance)
     log = {
         "episode/length_s": among(measures.steps * period, over),
         "episode/ended": over.sum().astype(jnp.float32),
@@ -85,9 +87,11 @@ def _episodes(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Lo
         "walk/forward_speed": measures.forward_speed.mean(),
         "walk/airborne": measures.airborne.mean(),
         "walk/reward": trace.reward.mean(),
+        "foothold/distance": among(jnp.where(placed, distance, 0.0), placed),
+        "foothold/empty": among(~jnp.isfinite(distance), measures.touchdown),
     }
     for number, kind in enumerate(kinds):
         here = measures.kind == number
-        log[f"level/{kind}"] = among(measures.level, here)
+        log[f"level/{kind}"] = among(measures.rank, here)
         log[f"fell/{kind}"] = among(ending.terminated, here & over)
     return log

@@ -6,6 +6,7 @@ Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
 import contextlib
 import dataclasses
 import functools
+import itertools
 import math
 import os
 import subprocess
@@ -30,7 +31,19 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from PIL import Image
 from rich.progress import track
 
-from cref_jax import cli, config, evaluation, lanes, ppo, rollout, runs, scene
+from cref_jax import (
+    cli,
+    config,
+    evaluation,
+    foothold,
+    lanes,
+    network,
+    panel,
+    ppo,
+    rollout,
+    runs,
+    scene,
+)
 from cref_jax.config import Config, ConfigError
 from cref_jax.lanes import Atlas
 from cref_jax.world import World
@@ -89,8 +102,19 @@ class Recording(NamedTuple):
 
     qpos: Float[np.ndarray, "T Q"]  # before each control step
     airborne: Bool[np.ndarray, "T F"]
+    marks: Float[np.ndarray, "T F K 3"]  # m, where each foot may step; NaN where it may not
+    minds: "Minds | None"  # None: no trained policy
     progress: float  # m along the lane
     ending: str | None  # a field of episode.Ending; None: the time was over
+
+
+class Minds(NamedTuple):
+    """What a policy saw and did at each step; a blind one has a gate alone."""
+
+    gate: Float[Array | np.ndarray, "*T D"]
+    depth: Float[Array | np.ndarray, "*T H W"] | None  # D
+    seen: Bool[Array | np.ndarray, "*T"]  # there was a frame
+    attention: Float[Array | np.ndarray, "*T N"] | None  # mean over the heads
 
 
 class Step(NamedTuple):
@@ -98,6 +122,8 @@ class Step(NamedTuple):
 
     qpos: Float[Array, " Q"]  # before it
     airborne: Bool[Array, " F"]
+    marks: Float[Array, "F K 3"]
+    mind: Minds | None
     progress: Float[Array, ""]  # m
     ending: dict[str, Bool[Array, ""]]
 
@@ -106,7 +132,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.play")
     with cli.one_line_errors(options.debug):
-        cli.use_compile_cache()
+        cli.prepare()
         play(options)
 
 
@@ -126,11 +152,11 @@ def play(options: Options) -> None:
         recording = record(world, train, options)
         if options.stills:
             moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
-            _write_stills(out, _film(canvas, recording, moments, period))
+            _write_stills(out, _film(canvas, recording, moments, c))
         else:
             stride = max(1, round(1.0 / (FRAME_RATE * period)))
             moments = np.arange(0, len(recording.qpos), stride)
-            _write_video(out, _film(canvas, recording, moments, period), 1.0 / (stride * period))
+            _write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
     print(f"wrote {out}")
     print(summary(recording, options.command, period))
 
@@ -151,6 +177,8 @@ def record(world: World, train: ppo.TrainState | None, options: Options) -> Reco
     return Recording(
         qpos=np.stack([step.qpos for step in steps]),
         airborne=np.stack([step.airborne for step in steps]),
+        marks=np.stack([step.marks for step in steps]),
+        minds=jax.tree.map(lambda *x: np.stack(x), *(step.mind for step in steps)),
         progress=float(steps[-1].progress),
         ending=over[0] if over else None,
     )
@@ -179,20 +207,33 @@ def _advance(
     """Step the robot with the agent's action."""
     c = world.config.network
     joints = len(world.physics.robot.joint_names)
-    memory, action = robots.memory, jnp.zeros((1, joints))
+    memory, action, mind = robots.memory, jnp.zeros((1, joints)), None
     if train is not None:
         memory, policy = rollout.act(rollout.networks(c, joints), train, robots)
-        action = policy.mean[0]
+        action, mind = policy.mean[0], _mind(robots, policy)
     elif agent == "random":
         action = c.initial_std * jax.random.normal(key, action.shape)
     after, outcome = rollout.advance(world, robots, memory, action)
     step = Step(
         qpos=robots.env.body.qpos[0],
         airborne=outcome.measures.airborne[0],
+        marks=foothold.points(jax.tree.map(lambda x: x[0], robots.env.candidates)),
+        mind=mind,
         progress=outcome.measures.progress[0],
         ending={name: flag[0] for name, flag in outcome.ending._asdict().items()},
     )
     return after, step
+
+
+def _mind(robots: rollout.Robots, policy: network.Output) -> Minds:
+    """Return what the first robot's policy sees and does."""
+    feed, weights = robots.feed, policy.attention
+    return Minds(
+        gate=policy.gate[0, 0],
+        depth=None if feed is None else feed.frame[0].astype(jnp.float32),
+        seen=jnp.zeros((), bool) if feed is None else feed.seen[0],
+        attention=None if weights is None else weights[0, 0].mean(axis=0),
+    )
 
 
 def _check(options: Options) -> None:
@@ -257,12 +298,25 @@ def _lane(c: config.Terrain, options: Options) -> Atlas:
 
 
 def _film(
-    canvas: scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], period: float
+    canvas: scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], c: Config
 ) -> Iterator[scene.Frame]:
-    """Yield the pictures of the robot after so many control steps."""
+    """Yield the pictures of the robot after so many control steps, the panel beside it."""
+    period = c.physics.control_period
     points = scene.camera_path(recording.qpos, period)
     for t in _tracked(moments, "drawing"):
-        yield canvas.draw(recording.qpos[t], points[t])
+        world = canvas.draw(recording.qpos[t], points[t], recording.marks[t])
+        minds = recording.minds
+        if minds is None:
+            yield world
+            continue
+        upto = max(0, t + 1 - round(panel.SECONDS / period))
+        mind = panel.Mind(
+            depth=minds.depth[t] if minds.depth is not None and minds.seen[t] else None,
+            attention=None if minds.attention is None else minds.attention[t],
+            gates=np.asarray(minds.gate[upto : t + 1]),
+        )
+        side = panel.draw(mind, HEIGHT, c.camera.d_max, period, sees=minds.depth is not None)
+        yield np.concatenate([world, side], axis=1)
 
 
 def _tracked(items: Iterable[T], title: str) -> Iterable[T]:
@@ -281,7 +335,10 @@ def _write_stills(out: Path, frames: Iterable[scene.Frame]) -> None:
 def _write_video(out: Path, frames: Iterable[scene.Frame], rate: float) -> None:
     """Write pictures as a film of `rate` pictures a second."""
     part = out.with_suffix(".part.mp4")  # a film that was cut off does not replace a whole one
-    source = f"-f rawvideo -pix_fmt rgb24 -s {WIDTH}x{HEIGHT} -r {rate:g} -i -"
+    frames = iter(frames)
+    first = next(frames)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {rate:g} -i -"
     target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags faststart"
     program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
     command = [*program, *source.split(), *target.split(), str(part)]
@@ -289,7 +346,7 @@ def _write_video(out: Path, frames: Iterable[scene.Frame], rate: float) -> None:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
             assert ffmpeg.stdin and ffmpeg.stderr
             with contextlib.suppress(BrokenPipeError):  # it says why, and exits
-                for frame in frames:
+                for frame in itertools.chain([first], frames):
                     ffmpeg.stdin.write(frame.tobytes())
             said = ffmpeg.communicate()[1].decode(errors="replace").strip()
         if ffmpeg.returncode:

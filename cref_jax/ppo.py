@@ -43,8 +43,8 @@ class Prediction(Protocol):
 class Networks(NamedTuple):
     """The two functions that are trained. They take normalised observations."""
 
-    # (params, carry, obs [T, E, O], begins [T, E]) -> (carry, prediction)
-    actor: Callable[[PyTree, PyTree, Array, Array], tuple[PyTree, Prediction]]
+    # (params, carry, obs [T, E, O], begins [T, E], sight) -> (carry, prediction)
+    actor: Callable[[PyTree, PyTree, Array, Array, PyTree], tuple[PyTree, Prediction]]
     # (params, critic_obs [T, E, S]) -> value [T, E]
     critic: Callable[[PyTree, Array], Array]
 
@@ -91,6 +91,7 @@ class Rollout(NamedTuple):
     begins: Bool[Array, "T E"]  # this step is the first of an episode: memory is empty before it
     valid: Bool[Array, "T E"]  # False where the simulation failed; the next step must begin anew
     carry: PyTree[Float[Array, "E ?H"]]  # the actor's memory before the first step
+    sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # what the actor looks at besides, as it is
 
 
 class Batch(NamedTuple):
@@ -108,6 +109,7 @@ class Batch(NamedTuple):
     begins: Bool[Array, "T E"]
     valid: Bool[Array, "T E"]
     carry: PyTree[Float[Array, "E ?H"]]
+    sight: PyTree[Shaped[Array, "?K E *?n"]] = None
 
 
 class Losses(NamedTuple):
@@ -202,6 +204,7 @@ def judge(statistics: Statistics, rollout: Rollout, c: config.PPO) -> Batch:
         begins=clean.begins,
         valid=clean.valid,
         carry=clean.carry,
+        sight=clean.sight,
     )
 
 
@@ -250,7 +253,7 @@ def loss(
     params: Params, batch: Batch, c: config.PPO, networks: Networks
 ) -> tuple[Float[Array, ""], Losses]:
     """Return the weighted loss of a minibatch, and its parts."""
-    _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins)
+    _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins, batch.sight)
     value = networks.critic(params.critic, batch.critic_obs)
     new = log_prob(batch.action, policy.mean, policy.log_std)
     old = log_prob(batch.action, batch.mean, batch.log_std)
@@ -373,5 +376,5 @@ def _zero_invalid(rollout: Rollout) -> Rollout:
         valid = rollout.valid.reshape(rollout.valid.shape + (1,) * (x.ndim - 2))
         return jnp.where(valid, x, jnp.zeros_like(x))
 
-    clean = jax.tree.map(keep, rollout._replace(carry=()))
-    return clean._replace(begins=rollout.begins, carry=rollout.carry)
+    clean = jax.tree.map(keep, rollout._replace(carry=(), sight=()))
+    return clean._replace(begins=rollout.begins, carry=rollout.carry, sight=rollout.sight)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from cref_jax import config
 from cref_jax.robot import Robot
@@ -36,6 +36,8 @@ class Snapshot(NamedTuple):
     foot_force: Float[Array, "F 3"]  # N, mean over the control step
     first_contact: Bool[Array, " F"]  # the foot has come down in this step
     air_time: Float[Array, " F"]  # s, length of the aerial phase that it ended
+    foothold_distance: Float[Array, " F"]  # m, d_xz to the nearest candidate; inf: there is none
+    unsupported: Int[Array, " F"]  # samples of the sole that are over nothing
     since_single: Float[Array, ""]  # s since exactly one foot touched
     control_period: Float[Array, ""]  # s
 
@@ -92,6 +94,16 @@ def feet_contact(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""
 def feet_y_distance(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """exp(-10 |d_y - 0.27|)."""
     return jnp.exp(-10.0 * jnp.abs(s.feet_y - c.feet_y_target))
+
+
+def foothold_placement(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """Sum over feet of I_td exp(-d_xz / s_xz), Sec. II-C; 0 for a foot without a candidate."""
+    return jnp.sum(s.first_contact * jnp.exp(-s.foothold_distance / c.foothold_tolerance))
+
+
+def foot_contact_quality(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """Sum over feet of C_i sum_j I(d_ij < epsilon), BeamDojo's term (arXiv 2502.10363)."""
+    return jnp.sum(is_touching(s.foot_force, c) * s.unsupported).astype(jnp.float32)
 
 
 def base_height(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
@@ -184,6 +196,8 @@ TERMS: dict[str, Term] = {
         orientation,
         feet_contact,
         feet_y_distance,
+        foothold_placement,
+        foot_contact_quality,
         base_height,
         linear_velocity_z,
         angular_velocity_xy,

@@ -1,6 +1,7 @@
 """T steps of E robots under a policy: the one place where the environment meets the learner.
 
-Training and evaluation share it. The robots' axis is E, and every record is [T, E, ...].
+Training and evaluation share it. The robots' axis is E, and every record is [T, E, ...]. All
+cameras run on one clock: a clock of its own for each robot would render every image at 50 Hz.
 """
 
 from typing import NamedTuple, no_type_check
@@ -8,9 +9,9 @@ from typing import NamedTuple, no_type_check
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float16, Int, PRNGKeyArray
 
-from cref_jax import config, env, episode, network, ppo
+from cref_jax import config, depth, env, episode, network, ppo
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
@@ -19,13 +20,44 @@ from cref_jax.world import World
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
+class Feed:
+    """What the cameras have delivered."""
+
+    frame: Float16[Array, "E H W"]  # D, the last one that came
+    seen: Bool[Array, " E"]  # it is of this episode
+    fresh: Bool[Array, ""]  # it came in the last step
+    clock: Int[Array, ""]  # control steps since the cameras were started
+
+
+class Memory(NamedTuple):
+    """What the policy holds between two control steps."""
+
+    carry: network.Carry
+    features: network.Features | None  # of the frame at hand, [1, E, ...]; None for a blind policy
+
+
+@no_type_check
+@flax.struct.dataclass
 class Robots:
     """E robots between two control steps, with what their policy remembers."""
 
     env: EnvState
     observation: Observation
-    memory: network.Carry
+    memory: Memory
     begins: Bool[Array, " E"]  # the next step is the first of an episode
+    feed: Feed | None = None  # None for a blind policy
+
+
+class Networks(NamedTuple):
+    """The modules that are trained."""
+
+    actor: network.Actor
+    critic: network.Critic
+
+    @property
+    def functions(self) -> ppo.Networks:
+        """The same as functions of their parameters."""
+        return ppo.Networks(actor=self.actor.apply, critic=self.critic.apply)
 
 
 class _Step(NamedTuple):
@@ -37,6 +69,8 @@ class _Step(NamedTuple):
     mean: Float[Array, "E J"]
     log_std: Float[Array, "E J"]
     outcome: Outcome
+    held: Int[Array, ""]  # the frame at hand, in the album
+    seen: Bool[Array, " E"]
 
 
 class Trace(NamedTuple):
@@ -47,10 +81,9 @@ class Trace(NamedTuple):
     measures: env.Measures
 
 
-def networks(c: config.Network, num_actions: int) -> ppo.Networks:
-    """Return the actor and the critic as functions of their parameters."""
-    actor, critic = network.Actor(c, num_actions), network.Critic(c)
-    return ppo.Networks(actor=actor.apply, critic=critic.apply)
+def networks(c: config.Network, num_actions: int) -> Networks:
+    """Return the actor and the critic."""
+    return Networks(network.Actor(c, num_actions), network.Critic(c))
 
 
 def initial_params(
@@ -58,13 +91,13 @@ def initial_params(
 ) -> ppo.Params:
     """Return fresh parameters for observations of the robots' shapes."""
     key_actor, key_critic = jax.random.split(key)
-    seen = robots.observation
     one = lambda x: x[None, :1]
-    memory = network.initial_carry(c, 1)
-    actor = network.Actor(c, num_actions)
+    carry, nets = network.initial_carry(c, 1), networks(c, num_actions)
+    obs, begins = one(robots.observation.proprioception), one(robots.begins)
+    sight = robots.feed and network.Sight(one(robots.feed.frame), begins * 0, begins)
     return ppo.Params(
-        actor=actor.init(key_actor, memory, one(seen.proprioception), one(robots.begins)),
-        critic=network.Critic(c).init(key_critic, one(seen.privileged)),
+        actor=nets.actor.init(key_actor, carry, obs, begins, sight),
+        critic=nets.critic.init(key_critic, one(robots.observation.privileged)),
     )
 
 
@@ -80,51 +113,130 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
     longest = round(c.episode.length / c.physics.control_period)
     state = state.replace(step=jax.random.randint(key_step, (num_envs,), 0, longest))
     seen = jax.vmap(env.observe, in_axes=(None, 0, 0))(world, state, split(key_see))
+    sees = c.network.variant != "blind"
     return Robots(
         env=state,
         observation=seen,
-        memory=network.initial_carry(c.network, num_envs),
+        memory=Memory(
+            network.initial_carry(c.network, num_envs),
+            network.no_features(c.network, c.camera.shape, num_envs) if sees else None,
+        ),
         begins=jnp.ones(num_envs, bool),
+        feed=_first_feed(c.camera, num_envs) if sees else None,
     )
 
 
-def act(
-    nets: ppo.Networks, train: ppo.TrainState, robots: Robots
-) -> tuple[network.Carry, network.Output]:
-    """Return the policy's memory after this step and its outputs, [1, E, ...]."""
+def act(nets: Networks, train: ppo.TrainState, robots: Robots) -> tuple[Memory, network.Output]:
+    """Return the policy's memory after this step and its outputs, [1, E, ...].
+
+    A frame is encoded when it comes, and its features are held until the next one.
+    """
+    params, feed, (carry, features) = train.params.actor, robots.feed, robots.memory
     obs = ppo.normalise(train.statistics.obs, robots.observation.proprioception)
-    return nets.actor(train.params.actor, robots.memory, obs[None], robots.begins[None])
+    view = None
+    if feed is not None:
+        encode = lambda: nets.actor.apply(params, feed.frame[None], method="encode")
+        features = jax.lax.cond(feed.fresh, encode, lambda: features)
+        view = network.View(features, jnp.zeros_like(feed.seen[None], jnp.int32), feed.seen[None])
+    carry, output = nets.actor.apply(
+        params, carry, obs[None], robots.begins[None], view, method="decide"
+    )
+    return Memory(carry, features), output
 
 
 def advance(
-    world: World, robots: Robots, memory: network.Carry, action: Float[Array, "E J"]
+    world: World, robots: Robots, memory: Memory, action: Float[Array, "E J"]
 ) -> tuple[Robots, Outcome]:
-    """Step every robot with its action."""
+    """Step every robot with its action, and its camera."""
     state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, robots.env, action)
     over = outcome.ending.terminated | outcome.ending.truncated
-    return Robots(state, outcome.observation, memory, begins=over), outcome
+    feed = robots.feed and _next_feed(world, robots.feed, robots.env, over)
+    return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome
 
 
 def collect(
-    world: World, nets: ppo.Networks, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
+    world: World, nets: Networks, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
 ) -> tuple[Robots, ppo.Rollout, Trace]:
-    """Return a horizon of experience, with actions drawn from the policy."""
+    """Return a horizon of experience, with actions drawn from the policy.
 
-    def step(robots: Robots, key: PRNGKeyArray) -> tuple[Robots, _Step]:
+    The features of the frame at hand are those of older parameters, so it is encoded anew; after
+    the horizon they are dropped, since they can be had from the frame.
+    """
+    c = world.config
+    first = robots
+    if robots.feed is not None:
+        robots = robots.replace(feed=robots.feed.replace(fresh=jnp.ones((), bool)))
+
+    def step(watch: _Watch, key: PRNGKeyArray) -> tuple[_Watch, _Step]:
+        robots = watch.robots
         memory, policy = act(nets, train, robots)
         mean = policy.mean[0]
         action = mean + jnp.exp(policy.log_std) * jax.random.normal(key, mean.shape)
         after, outcome = advance(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
-        return after, _Step(robots.observation, robots.begins, action, mean, log_std, outcome)
+        seen = robots.feed.seen if robots.feed is not None else robots.begins
+        done = _Step(
+            robots.observation, robots.begins, action, mean, log_std, outcome, watch.held, seen
+        )
+        return _filed(watch.replace(robots=after)), done
 
-    keys = jax.random.split(key, world.config.ppo.horizon)
-    after, steps = jax.lax.scan(step, robots, keys)
-    value = lambda s: nets.critic(
+    keys = jax.random.split(key, c.ppo.horizon)
+    watch, steps = jax.lax.scan(step, _opened(c, robots), keys)
+    after = watch.robots
+    if after.feed is not None:
+        blank = jax.tree.map(jnp.zeros_like, after.memory.features)
+        after = after.replace(memory=after.memory._replace(features=blank))
+    rollout = _rollout(nets, train, first.memory.carry, watch.album, steps)
+    outcome = steps.outcome
+    return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
+
+
+@no_type_check
+@flax.struct.dataclass
+class _Watch:
+    """The robots during a horizon, and the frames that have come so far."""
+
+    robots: Robots
+    album: Float16[Array, "K E H W"] | None
+    held: Int[Array, ""]  # where the frame at hand is in the album
+
+
+def _opened(c: config.Config, robots: Robots) -> _Watch:
+    """Return the start of a horizon: the frame at hand is the album's first."""
+    album = None
+    if robots.feed is not None:
+        count = 1 + depth.most_frames(c.ppo.horizon - 1, c.camera, c.physics.control_period)
+        album = jnp.zeros((count, *robots.feed.frame.shape), robots.feed.frame.dtype)
+        album = album.at[0].set(robots.feed.frame)
+    return _Watch(robots, album, jnp.zeros((), jnp.int32))
+
+
+def _filed(watch: _Watch) -> _Watch:
+    """Put a frame that has just come into the album; one after the last step is the next's."""
+    feed = watch.robots.feed
+    if feed is None or watch.album is None:
+        return watch
+    held = watch.held + feed.fresh.astype(jnp.int32)
+    album = watch.album.at[held].set(feed.frame, mode="drop")
+    return watch.replace(album=album, held=held)
+
+
+def _rollout(
+    nets: Networks,
+    train: ppo.TrainState,
+    carry: network.Carry,
+    album: Float16[Array, "K E H W"] | None,
+    steps: _Step,
+) -> ppo.Rollout:
+    """Return a horizon's steps as the update takes them."""
+    value = lambda s: nets.critic.apply(
         train.params.critic, ppo.normalise(train.statistics.critic_obs, s)
     )
-    outcome = steps.outcome
-    rollout = ppo.Rollout(
+    outcome, sight = steps.outcome, None
+    if album is not None:
+        held = jnp.broadcast_to(steps.held[:, None], steps.seen.shape)
+        sight = network.Sight(album, held, steps.seen)
+    return ppo.Rollout(
         obs=steps.observation.proprioception,
         critic_obs=steps.observation.privileged,
         velocity=steps.observation.velocity,
@@ -138,6 +250,29 @@ def collect(
         truncated=outcome.ending.truncated,
         begins=steps.begins,
         valid=~outcome.ending.unstable,
-        carry=robots.memory,
+        carry=carry,
+        sight=sight,
     )
-    return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
+
+
+def _first_feed(c: config.Camera, num_envs: int) -> Feed:
+    """Return the state of cameras that have delivered nothing."""
+    return Feed(
+        frame=jnp.zeros((num_envs, *c.shape), jnp.float16),  # 16 bits: to 0.4 mm at 3 m
+        seen=jnp.zeros(num_envs, bool),
+        fresh=jnp.zeros((), bool),
+        clock=jnp.zeros((), jnp.int32),
+    )
+
+
+def _next_feed(world: World, feed: Feed, before: EnvState, over: Bool[Array, " E"]) -> Feed:
+    """Return what has been delivered after the step that led away from the states `before`.
+
+    A frame shows the robot one control step earlier: it is 20 ms old when the policy first uses it
+    (assumed). One that was exposed before the end of an episode is not shown to the next.
+    """
+    c, clock = world.config, feed.clock + 1
+    due = depth.is_due(clock, c.camera, c.physics.control_period)
+    expose = lambda: jax.vmap(env.depth_image, in_axes=(None, 0))(world, before)
+    frame = jax.lax.cond(due, lambda: expose().astype(jnp.float16), lambda: feed.frame)
+    return Feed(frame=frame, seen=(feed.seen | due) & ~over, fresh=due, clock=clock)

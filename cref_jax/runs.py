@@ -108,6 +108,28 @@ def world_of(c: Config, engine: EngineName = "auto") -> World:
     return make_world(c, Physics(c.robot, c.physics, resolve_engine(engine)))
 
 
+def check_memory(program: jax.stages.Compiled, num_envs: int) -> int:
+    """Return the bytes that a program takes while it runs, its arguments included.
+
+    Raises:
+        ConfigError: the device has less.
+    """
+    m = program.memory_analysis()
+    if m is None:  # a device that does not tell
+        return 0
+    needed = m.argument_size_in_bytes + m.temp_size_in_bytes
+    needed += m.output_size_in_bytes - m.alias_size_in_bytes
+    stats = jax.devices()[0].memory_stats()  # a CPU has none
+    there = stats["bytes_limit"] if stats else _main_memory()
+    if needed > there:
+        fits = num_envs * there // needed
+        raise ConfigError(
+            f"{num_envs} robots need {needed / 2**30:.1f} GiB and the device has "
+            f"{there / 2**30:.1f}; take --num-envs {2 ** (fits.bit_length() - 1)}"
+        )
+    return needed
+
+
 def load_policy(run: Path, world: World) -> Policy:
     """Return the newest policy of a run; `world` may have another terrain than it was trained on.
 
@@ -121,6 +143,11 @@ def load_policy(run: Path, world: World) -> Policy:
         newest = steps.latest()
         train = steps.restore_part("train", like, newest)
         return Policy(c, train, newest or 0, run)
+
+
+def _main_memory() -> int:
+    """Return the machine's memory, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _git_state() -> str | None:

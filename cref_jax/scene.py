@@ -26,6 +26,10 @@ TONES = ((0.80, 0.78, 0.74), (0.66, 0.65, 0.63))  # red, green, blue
 PLAIN = (0.66, 0.72, 0.78)
 SKY = ((0.30, 0.50, 0.75), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
 
+MARKS = ((0.95, 0.45, 0.10, 1.0), (0.10, 0.65, 0.30, 1.0))  # colours of the left and right foot's
+MARK_RADIUS = 0.015  # m
+NO_MARKS = np.zeros((0, 0, 3))
+
 AZIMUTH = 100.0  # deg, where the camera looks: the robot walks to the right, and nearer a little
 ELEVATION = -14.0  # deg
 DISTANCE = 4.0  # m, from the camera to the pelvis
@@ -114,13 +118,34 @@ class Canvas:
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
 
-    def draw(self, qpos: Float[np.ndarray, " Q"], look_at: Float[np.ndarray, "3"]) -> Frame:
-        """Return the picture of the robot in this pose, the camera turned to a point of space."""
+    def draw(
+        self,
+        qpos: Float[np.ndarray, " Q"],
+        look_at: Float[np.ndarray, "3"],
+        marks: Float[np.ndarray, "F K 3"] = NO_MARKS,
+    ) -> Frame:
+        """Return the picture of the robot in this pose, the camera turned to a point of space.
+
+        `marks` are points to show, m, a colour for each foot; those that are NaN are left out.
+        """
         self._data.qpos[:] = qpos
         mujoco.mj_forward(self._model, self._data)
         self._camera.lookat[:] = look_at
         self._renderer.update_scene(self._data, self._camera)
+        for points, colour in zip(marks, MARKS, strict=False):
+            for point in points[np.isfinite(points).all(axis=-1)]:
+                self._mark(point, colour)
         return self._renderer.render()
+
+    def _mark(self, point: Float[np.ndarray, "3"], colour: tuple[float, ...]) -> None:
+        """Add a ball to the scene that is about to be drawn."""
+        drawn = self._renderer.scene
+        size, straight = np.full(3, MARK_RADIUS), np.eye(3).ravel()
+        ball = mujoco.mjtGeom.mjGEOM_SPHERE
+        mujoco.mjv_initGeom(
+            drawn.geoms[drawn.ngeom], ball, size, point, straight, np.array(colour, np.float32)
+        )
+        drawn.ngeom += 1
 
 
 def camera_path(qpos: Float[np.ndarray, "T Q"], period: float) -> Float[np.ndarray, "T 3"]:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 FAR = 1.0  # m, distance of a contact plane that is not there
+BLOCKS = (1, 4, 16, 64)  # columns, sides of the blocks whose tops are stored; powers of two
 _TOUCHING = 1e-6  # m, no distance is taken as shorter, so that every direction has a length
 _NEIGHBOURS = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 _ABOVE = 1e-5  # m, a second contact lies further than this in front of the first one's plane
@@ -24,11 +25,17 @@ _ABOVE = 1e-5  # m, a second contact lies further than this in front of the firs
 class Terrain:
     """A window of a grid of columns."""
 
-    heights: Float[Array, "X Y"]  # m, of the whole grid
+    tops: Float[Array, " N"]  # m, of the columns row by row, then of each size of BLOCKS
     origin: Float[Array, " 2"]  # m, outer corner of the window's first column
     first: Int[Array, " 2"]  # the window's first column
     size: Int[Array, " 2"]  # columns in the window
     cell: float = flax.struct.field(pytree_node=False)  # m, side of a column
+    shape: tuple[int, int] = flax.struct.field(pytree_node=False)  # X, Y, of the whole grid
+
+    @property
+    def heights(self) -> Float[Array, "X Y"]:
+        """Heights of the whole grid, m."""
+        return self.tops[: self.shape[0] * self.shape[1]].reshape(self.shape)
 
 
 def from_heights(
@@ -37,11 +44,12 @@ def from_heights(
     """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell."""
     heights = jnp.asarray(heights, jnp.float32)
     return Terrain(
-        heights=heights,
+        tops=jnp.concatenate([_block_tops(heights, side).reshape(-1) for side in BLOCKS]),
         origin=jnp.asarray(origin, jnp.float32),
         first=jnp.zeros(2, jnp.int32),
         size=jnp.asarray(heights.shape, jnp.int32),
         cell=float(cell),
+        shape=heights.shape,
     )
 
 
@@ -102,6 +110,31 @@ def contact_planes(
     return jnp.stack(points), jnp.stack(normals), jnp.stack(distances)
 
 
+def block_top(
+    terrain: Terrain,
+    level: Int[Array, "*rays"],
+    i: Int[Array, "*rays"],
+    j: Int[Array, "*rays"],
+) -> tuple[Float[Array, "*rays"], Bool[Array, "*rays"]]:
+    """Return the height of the highest column of a block, m, and whether all are as high.
+
+    It is the block of BLOCKS[level] x BLOCKS[level] columns around column (i, j) of the window, or
+    around the nearest one inside of it. Blocks are counted from the grid's first column, not from
+    the window's. Larger blocks are at most one unit in the last place higher than their columns.
+    """
+    i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
+    j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
+    start, index = 0, jnp.zeros_like(i)
+    for k, side in enumerate(BLOCKS):
+        rows, across = (-(-n // side) for n in terrain.shape)
+        shift = side.bit_length() - 1
+        index = jnp.where(level == k, start + (i >> shift) * across + (j >> shift), index)
+        start += rows * across
+    # unsigned: an index that may be negative would be looked at once more
+    top = terrain.tops.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds")
+    return top, (level == 0) | (_bits(top) & 1 == 1)
+
+
 class _Offset(NamedTuple):
     """From `p` to the closest point of one column: a vector and its square, as scalars, m.
 
@@ -148,8 +181,28 @@ def _height(terrain: Terrain, i: Int[Array, "..."], j: Int[Array, "..."]) -> Flo
     """Return the height of column (i, j) of the window, or of the nearest one inside of it."""
     i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
     j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
-    flat = i * terrain.heights.shape[1] + j
-    return terrain.heights.reshape(-1).at[flat].get(mode="promise_in_bounds")
+    return terrain.tops.at[i * terrain.shape[1] + j].get(mode="promise_in_bounds")
+
+
+def _block_tops(heights: Float[Array, "X Y"], side: int) -> Float[Array, "x y"]:
+    """Return the height of the highest column of each block, m.
+
+    The lowest bit says whether all columns of the block are as high: one number, because a second
+    one would double the time to read it. A height whose bit is wrong is rounded up.
+    """
+    if side == 1:
+        return heights
+    padding = [(0, -n % side) for n in heights.shape]
+    blocks = jnp.pad(heights, padding, mode="edge")
+    blocks = blocks.reshape(blocks.shape[0] // side, side, blocks.shape[1] // side, side)
+    top, bottom = blocks.max((1, 3)), blocks.min((1, 3))
+    wrong = (_bits(top) & 1 == 1) != (top == bottom)
+    return jnp.where(wrong, jnp.nextafter(top, jnp.inf), top)
+
+
+def _bits(x: Float[Array, "*rays"]) -> Int[Array, "*rays"]:
+    """Return the bits of a float."""
+    return jax.lax.bitcast_convert_type(x, jnp.int32)
 
 
 def _nearest(offsets: list[_Offset]) -> _Offset:

@@ -70,6 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with cli.one_line_errors(debug="--debug" in arguments):
+        cli.prepare()
         options, c = parse(arguments)
         if options.print_config:
             print(json.dumps(dataclasses.asdict(c), indent=2))
@@ -135,22 +136,59 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
     run = options.run_dir or runs.ROOT / _name(options)
-    cli.use_compile_cache()
     world = runs.world_of(c, options.engine)  # refuses a wrong terrain before anything is written
     with lock(run):
         with runs.checkpoints(run, c.run.keep) as steps:
-            state = _first_state(world, steps, options.resume, run)
+            first = _first_iteration(steps, options.resume, run)
+            runs.write_config(run, c)
             runs.write_origin(run)
-            first = int(state.train.iteration)
             samples = c.run.num_envs * c.ppo.horizon
             with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
                 report.say(_headline(run, c, options, first))
-                state = _loop(world, state, steps, report)
+                programs = _Programs(world, report)
+                if first < c.run.iterations:
+                    programs.of(min(c.run.chunk, c.run.iterations - first))
+                state = _first_state(world, steps, options.resume)
+                state = _loop(world, state, steps, report, programs)
         _summary(run, world, state, options.evaluate)
 
 
+class _Programs:
+    """The compiled programs of chunks of iterations."""
+
+    def __init__(self, world: World, report: Reporter) -> None:
+        self._world, self._report = world, report
+        self._shapes = jax.eval_shape(learn.initial_state, world)
+        self._of: dict[int, jax.stages.Compiled] = {}
+
+    def of(self, size: int) -> jax.stages.Compiled:
+        """Return the program of `size` iterations; the first one is announced and weighed.
+
+        Raises:
+            ConfigError: it needs more memory than there is.
+        """
+        if size not in self._of:
+            first = not self._of
+            if first:
+                self._report.say("compiling (a minute on four cores, seconds from the cache) ...")
+            begun = time.monotonic()
+            self._of[size] = learn.chunk.lower(self._world, self._shapes, size).compile()
+            if first:
+                seconds = time.monotonic() - begun
+                needed = runs.check_memory(self._of[size], self._world.config.run.num_envs)
+                self._report.say(
+                    f"compiled in {seconds:.0f} s; it takes {needed / 2**30:.1f} GiB of memory; "
+                    "Ctrl-C saves and stops"
+                )
+        return self._of[size]
+
+
 def _loop(
-    world: World, state: learn.RunState, steps: Checkpoints, report: Reporter
+    world: World,
+    state: learn.RunState,
+    steps: Checkpoints,
+    report: Reporter,
+    programs: _Programs,
 ) -> learn.RunState:
     """Train chunk by chunk; save in between, at the end, and when asked to stop."""
     c = world.config
@@ -158,23 +196,16 @@ def _loop(
     if done >= c.run.iterations:
         report.say(f"nothing left to do: {done} of {c.run.iterations} iterations are done")
         return state
-    report.say("compiling (half a minute on four cores, a few seconds from the cache) ...")
-    begun = time.monotonic()
-    size = min(c.run.chunk, c.run.iterations - done)
-    programs = {size: learn.chunk.lower(world, state, size).compile()}
-    report.say(f"compiled in {time.monotonic() - begun:.0f} s; Ctrl-C saves and stops")
     saved = time.monotonic()
     with cli.StopRequest() as stop:
         while done < c.run.iterations and not stop.asked:
-            size = min(c.run.chunk, c.run.iterations - done)
-            if size not in programs:
-                programs[size] = learn.chunk.lower(world, state, size).compile()
+            program = programs.of(min(c.run.chunk, c.run.iterations - done))
             begun = time.monotonic()
-            state, log = programs[size](world, state)
+            state, log = program(world, state)
             log = {name: np.asarray(values) for name, values in log.items()}
             report.chunk(done, log, time.monotonic() - begun)
             _check_health(log, c.run.num_envs * c.ppo.horizon)
-            done += size
+            done = int(state.train.iteration)
             if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
                 _save(steps, state, done)
                 saved = time.monotonic()
@@ -184,13 +215,22 @@ def _loop(
     return state
 
 
-def _first_state(world: World, steps: Checkpoints, resume: bool, run: Path) -> learn.RunState:
-    """Return the state to begin with: fresh, or that of the newest checkpoint."""
-    if resume and steps.latest() is None:
+def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
+    """Return how many iterations are done.
+
+    Raises:
+        ConfigError: there is nothing to resume, or something that would be overwritten.
+    """
+    latest = steps.latest()
+    if resume and latest is None:
         raise ConfigError(f"{run} has no checkpoint to resume; leave --resume out")
-    if not resume and steps.latest() is not None:
+    if not resume and latest is not None:
         raise ConfigError(f"{run} holds a run already; add --resume, or choose another --run-dir")
-    runs.write_config(run, world.config)
+    return latest or 0
+
+
+def _first_state(world: World, steps: Checkpoints, resume: bool) -> learn.RunState:
+    """Return the state to begin with: fresh, or that of the newest checkpoint."""
     state = jax.jit(learn.initial_state)(world)
     if not resume:
         return state

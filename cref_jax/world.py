@@ -52,4 +52,5 @@ def _settled(c: Config, physics: Physics) -> Body:
         return jax.lax.scan(hold, body, None, length=steps)[0]
 
     keys = jax.random.split(jax.random.key(c.terrain.seed), c.episode.bank_size)
-    return jax.jit(jax.vmap(settle))(keys)
+    # waited for: a program that calls the host must not outlive the interpreter
+    return jax.block_until_ready(jax.jit(jax.vmap(settle))(keys))

@@ -25,3 +25,30 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+# The package is imported inside of these: jaxtyping checks what is imported after it is set up.
+
+
+@pytest.fixture
+def world():
+    """Return lanes of every kind, made once."""
+    import sample
+
+    return sample.world()
+
+
+@pytest.fixture
+def resets():
+    """Return 512 robots at their start."""
+    import sample
+
+    return sample.resets()
+
+
+@pytest.fixture
+def robots():
+    """Return eight robots at their start."""
+    import sample
+
+    return sample.robots()

@@ -9,28 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sample
 from sample import ROBOTS, C, assert_equal, one, put
 
-from cref_jax import config, env, observation
+from cref_jax import config, env, observation, reward
 from cref_jax.physics import Physics
 
 LENGTH = C.terrain.lane_length
-
-
-@pytest.fixture
-def world():
-    return sample.world()
-
-
-@pytest.fixture
-def resets():
-    return sample.resets()
-
-
-@pytest.fixture
-def robots():
-    return sample.robots()
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +59,7 @@ def test_reaching_the_end_of_a_lane_truncates_and_raises_the_level(world, step, 
     after, outcome = step(world, put(robots, x=LENGTH - 0.9), still(robots))
     np.testing.assert_array_equal(outcome.ending.finished, ~is_open)
     np.testing.assert_array_equal(outcome.ending.truncated, ~is_open)
-    np.testing.assert_array_equal(after.level, level + ~is_open)
+    np.testing.assert_array_equal(after.rank, level + ~is_open)
 
 
 def test_a_robot_that_blows_up_gains_nothing_and_leaves_its_neighbours_alone(world, step, robots):
@@ -165,7 +149,29 @@ def lived(world, state, force):
     """Return the state a step later and its snapshot, had it ended with this force on the feet."""
     links = world.physics.links(state.body)
     snapshot = env._snapshot(world, state, state.body, links, force, state.action)
-    return env._lived(state, state.body, snapshot, C.reward), snapshot
+    return env._lived(world, state, state.body, links, snapshot), snapshot
+
+
+def test_candidates_are_found_at_liftoff_and_judged_at_touchdown(world, robots):
+    """The left foot: on the ground, up, up, down; the command is 0.6 m/s, so the gate is 0.3 m."""
+    state = one(robots).replace(command=jnp.array([0.6, 0.0, 0.0]))
+    live = jax.jit(lambda s, force: lived(world, s, force))
+    up, down = (jnp.array([[0.0, 0.0, left], [0.0, 0.0, 200.0]]) for left in (0.0, 200.0))
+    standing, _ = live(state, down)
+    assert not standing.candidates.accepted.any()
+    lifted, _ = live(standing, up)
+    assert lifted.candidates.accepted.any(axis=1).tolist() == [True, False]
+    moved = put(lifted, x=lifted.body.qpos[0] + 0.44)
+    swung, snapshot = live(moved, up)
+    np.testing.assert_array_equal(swung.candidates.x, lifted.candidates.x)
+    np.testing.assert_array_equal(swung.candidates.origin, lifted.candidates.origin)
+    # level ground; the nearest window that is past 0.3 m begins with the sample at 0.33 m, and its
+    # mean is 0.11 m further: the foot, turned a little from the lane, is about 0.44 m ahead
+    assert snapshot.foothold_distance[0] < 0.02 and jnp.isinf(snapshot.foothold_distance[1])
+    _, landed = live(swung, down)
+    assert landed.first_contact.tolist() == [True, False]
+    placed = reward.foothold_placement(landed, C.reward, world.physics.robot)
+    assert float(placed) > np.exp(-0.02 / 0.08)
 
 
 def test_contacts_time_the_phases_of_a_gait(world, robots):

@@ -14,21 +14,6 @@ LENGTH = C.terrain.lane_length
 PERIOD = C.physics.control_period
 
 
-@pytest.fixture
-def world():
-    return sample.world()
-
-
-@pytest.fixture
-def resets():
-    return sample.resets()
-
-
-@pytest.fixture
-def robots():
-    return sample.robots()
-
-
 # The start
 
 
@@ -280,19 +265,44 @@ def test_only_an_end_without_a_failure_truncates(cause):
         (3.0, 9.0, 1, "finished", 2),  # reached the end, however long the lane was
     ],
 )
-def test_the_next_level(world, robots, walked, commanded, level, cause, expected):
-    state = one(robots).replace(level=jnp.int32(level), commanded=jnp.float32(commanded))
+def test_a_rank_is_won_and_lost(world, robots, walked, commanded, level, cause, expected):
+    rank, next_level = after(world, robots, walked, commanded, level, level, cause, review=0.0)
+    assert int(rank) == int(next_level) == expected
+
+
+def after(world, robots, walked, commanded, level, rank, cause, review, key=0):
+    """Return rank and next level of a robot that walked so far on a lane of this level."""
+    c = config.override(C, {"curriculum": {"review": review}})
+    state = one(robots).replace(
+        level=jnp.int32(level), rank=jnp.int32(rank), commanded=jnp.float32(commanded)
+    )
     state = put(state, x=state.start[0] + walked)
     over = Ending(*(jnp.array(name == cause) for name in Ending._fields))
-    assert int(episode.next_level(world, state, over, jax.random.key(0))) == expected
+    return episode.promoted(world.replace(config=c), state, over, jax.random.key(key))
+
+
+def test_an_easy_level_neither_wins_nor_costs_a_rank(world, robots):
+    for walked, cause in ((11.0, "finished"), (0.1, "tilted")):
+        rank, next_level = after(world, robots, walked, 9.0, 0, 1, cause, review=0.0)
+        assert int(rank) == int(next_level) == 1
+
+
+def test_a_share_of_the_episodes_is_on_any_level_up_to_the_rank(world, robots):
+    draws = [after(world, robots, 5.9, 9.0, 2, 2, "timeout", 0.5, key) for key in range(200)]
+    assert {int(rank) for rank, _ in draws} == {2}
+    share = np.bincount([int(level) for _, level in draws], minlength=3) / len(draws)
+    # half of them review, a third of those each level: 1/6, 1/6, 2/3; three deviations are 0.1
+    np.testing.assert_allclose(share, [1 / 6, 1 / 6, 2 / 3], atol=0.1)
 
 
 def test_beyond_the_hardest_level_comes_a_random_one(world, robots):
-    state = one(robots).replace(level=jnp.int32(2), commanded=jnp.float32(9.0))
-    state = put(state, x=state.start[0] + 9.0)
-    over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
-    keys = jax.random.split(jax.random.key(0), 60)
-    levels = jax.vmap(lambda key: episode.next_level(world, state, over, key))(keys)
-    assert sorted(set(np.asarray(levels).tolist())) == [0, 1, 2]
+    passed = [after(world, robots, 9.0, 9.0, 2, 2, "finished", 0.0, key) for key in range(60)]
+    assert {int(rank) for rank, _ in passed} == {2}
+    assert {int(level) for _, level in passed} == {0, 1, 2}
+
+
+def test_without_a_curriculum_the_level_stays(world, robots):
     fixed = world.replace(config=config.override(C, {"curriculum": {"enabled": False}}))
-    assert int(episode.next_level(fixed, state, over, keys[0])) == 2
+    state = put(one(robots).replace(level=jnp.int32(1)), x=11.0)
+    over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
+    assert int(episode.promoted(fixed, state, over, jax.random.key(0))[1]) == 1

@@ -12,17 +12,17 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves"},
-    {"terrain", "shapes", "robot"},
+    {"config", "geometry", "deploy", "leaves", "layers"},
+    {"terrain", "shapes", "robot", "host_call"},
     {"kinematics", "lanes", "host_physics"},
     {"physics", "depth", "foothold"},
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
-    {"learn", "evaluation", "cli", "progress", "scene"},
+    {"learn", "evaluation", "cli", "progress", "scene", "panel"},
     {"runs"},
-    {"train", "eval", "play", "bench", "export", "sim2sim", "report"},
+    {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 

@@ -5,10 +5,10 @@ import pytest
 from flax import linen as nn
 from jax.test_util import check_grads
 
-from cref_jax import config, network
+from cref_jax import config, layers, network
 
 T, E, OBS, J = 6, 4, 7, 3
-SMALL = config.Network(token=8, lstm=10, gru=12, actor=(16, 8), critic=(16, 8))
+SMALL = config.Network(variant="blind", token=8, lstm=10, gru=12, actor=(16, 8), critic=(16, 8))
 
 
 ACTOR = network.Actor(SMALL, J)
@@ -62,7 +62,7 @@ def test_lstm_agrees_with_flax():
         },
         "recurrent": side_by_side(theirs, ("hi", "hf", "hg", "ho")),
     }
-    last, hidden = jax.jit(network.LSTM(5).apply)(
+    last, hidden = jax.jit(layers.LSTM(5).apply)(
         {"params": ours}, memory, x, jnp.zeros((T, E), bool)
     )
 
@@ -86,7 +86,7 @@ def test_gru_agrees_with_flax():
         "recurrent": side_by_side(theirs, ("hr", "hz", "hn")),
         "candidate_bias": theirs["hn"]["bias"],
     }
-    last, hidden = jax.jit(network.GRU(5).apply)(
+    last, hidden = jax.jit(layers.GRU(5).apply)(
         {"params": ours}, memory, x, jnp.zeros((T, E), bool)
     )
 
@@ -96,12 +96,12 @@ def test_gru_agrees_with_flax():
     np.testing.assert_allclose(last, memory, atol=1e-6)
 
 
-@pytest.mark.parametrize("cell", [network.LSTM(5), network.GRU(5)])
+@pytest.mark.parametrize("cell", [layers.LSTM(5), layers.GRU(5)])
 def test_gradients_through_a_cell_agree_with_finite_differences(cell):
     with jax.enable_x64(True):
         x = jax.random.normal(jax.random.key(0), (T, E, OBS))
         h = jax.random.normal(jax.random.key(1), (E, 5))
-        memory = (h, 0.5 * h) if isinstance(cell, network.LSTM) else h
+        memory = (h, 0.5 * h) if isinstance(cell, layers.LSTM) else h
         begins = some_begins()
         params = jax.jit(cell.init)(jax.random.key(2), memory, x, begins)
         params = jax.tree.map(lambda p: p.astype(jnp.float64), params)
@@ -183,7 +183,7 @@ def test_the_policy_does_not_train_the_velocity_estimator(params, obs):
     moved = lambda grads, name: any(np.any(g) for g in jax.tree.leaves(grads[name]))
     by_action = gradient(lambda out: out.mean)
     by_velocity = gradient(lambda out: out.velocity)
-    rest = ("tokenizer", "fusion", "recurrent_fusion", "action_head")
+    rest = ("proprioceptive_tokenizer", "fusion", "recurrent_fusion", "action_head")
     assert not moved(by_action, "velocity_estimator")
     assert all(moved(by_action, name) for name in rest)
     assert moved(by_velocity, "velocity_estimator")
@@ -214,7 +214,7 @@ def test_the_highway_gate_chooses_between_memory_and_feature(bias, expected):
     params["gate"]["bias"] = jnp.full(3, bias)
     _, y, gate = jax.jit(fusion.apply)({"params": params}, start, f, begins)
 
-    _, h = jax.jit(network.GRU(5).apply)({"params": params["gru"]}, start, f, begins)
+    _, h = jax.jit(layers.GRU(5).apply)({"params": params["gru"]}, start, f, begins)
     sides = {"memory": h @ params["memory_out"]["kernel"], "feature": f}
     np.testing.assert_allclose(y, sides[expected], atol=1e-6)
     np.testing.assert_allclose(gate, 1.0 if bias > 0 else 0.0, atol=1e-6)
@@ -248,7 +248,7 @@ def test_shapes_and_names_are_those_that_the_export_relies_on(params, obs):
         "recurrent_fusion/gru/candidate_bias",
         "recurrent_fusion/memory_out/kernel",
         *dense("velocity_estimator/lstm/input", "velocity_estimator/velocity"),
-        *dense("tokenizer/layer_0", "tokenizer/layer_1"),
+        *dense("proprioceptive_tokenizer/layer_0", "proprioceptive_tokenizer/layer_1"),
         *dense("fusion/mix", "fusion/content_gate"),
         *dense("recurrent_fusion/gru/input", "recurrent_fusion/gate"),
         *dense("action_head/layer_0", "action_head/layer_1", "action_head/layer_2"),

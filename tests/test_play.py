@@ -82,7 +82,8 @@ def test_the_summary_worked_by_hand():
     # 50 steps of 20 ms are 1 s; the left foot is up in 20 of them, the right one in 10
     airborne = np.zeros((50, 2), bool)
     airborne[:20, 0] = airborne[20:30, 1] = True
-    said = play.summary(Recording(np.zeros((50, 19)), airborne, 0.5, "low"), 0.6, 0.02)
+    marks = np.full((50, 2, 25, 3), np.nan)
+    said = play.summary(Recording(np.zeros((50, 19)), airborne, marks, None, 0.5, "low"), 0.6, 0.02)
     assert "walked 0.50 m in 1.0 s, 0.50 of 0.60 m/s asked for, and fell" in said
     assert "left foot 40%, right foot 20%" in said
 

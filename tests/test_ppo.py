@@ -13,7 +13,7 @@ from cref_jax import config, network, ppo
 
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
-SMALL = config.Network(token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
+SMALL = config.Network(variant="blind", token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
 KEY = jax.random.key(0)
 NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
 
@@ -43,7 +43,7 @@ def some_rollout(seed=1):
     obs, critic_obs = normal(T, E, OBS), normal(T, E, CRITIC_OBS)
     begins = jax.random.bernoulli(next(keys), 0.2, (T, E))
     carry = jax.tree.map(lambda m: normal(*m.shape), network.initial_carry(SMALL, E))
-    _, policy = NETWORKS.actor(params.actor, carry, obs, begins)
+    _, policy = NETWORKS.actor(params.actor, carry, obs, begins, None)
     value = NETWORKS.critic(params.critic, critic_obs)
     return ppo.Rollout(
         obs=obs,
@@ -204,7 +204,9 @@ def test_the_loss_worked_by_hand():
         carry=(),
     )
     said = lambda m: OneStep(m[None, None, None], jnp.zeros(1), jnp.array([[[1.0, 2.0, 0.0]]]))
-    networks = ppo.Networks(lambda m, carry, obs, begins: (carry, said(m)), lambda v, s: one(v))
+    networks = ppo.Networks(
+        lambda m, carry, obs, begins, sight: (carry, said(m)), lambda v, s: one(v)
+    )
     params = ppo.Params(jnp.array(0.1), jnp.array(1.1))
     total, parts = ppo.loss(params, batch, config.PPO(), networks)
     np.testing.assert_allclose(total, 3.603588, rtol=1e-6)

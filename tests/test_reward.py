@@ -34,6 +34,7 @@ TABLE_1 = {
     "ankle_position": -10.0,
     "stumble": -10.0,
 }
+ALTERNATIVES = {"foot_contact_quality": 0.0}  # rows that take another's place, off by default
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +64,8 @@ def perfect(x2: robot.Robot) -> reward.Snapshot:
         foot_force=jnp.array([[0.0, 0.0, 200.0], [0.0, 0.0, 200.0]]),
         first_contact=jnp.zeros(2, bool),
         air_time=jnp.full(2, PERIOD),
+        foothold_distance=jnp.full(2, jnp.inf),
+        unsupported=jnp.zeros(2, jnp.int32),
         since_single=jnp.float32(9.0),
         control_period=jnp.float32(PERIOD),
     )
@@ -92,12 +95,27 @@ def check(x2: robot.Robot, name: str, expected: float, **changes) -> None:
 def test_a_row_a_function_and_a_weight_have_one_name():
     fields = [f.name for f in dataclasses.fields(config.RewardWeights)]
     assert sorted(reward.TERMS) == sorted(fields)
-    assert set(reward.TERMS) <= set(TABLE_1)
+    assert set(reward.TERMS) == set(TABLE_1 | ALTERNATIVES)
 
 
 def test_the_weights_are_those_of_table_1():
     weights = dataclasses.asdict(config.RewardWeights())
-    assert weights == {name: TABLE_1[name] for name in weights}
+    assert weights == TABLE_1 | ALTERNATIVES
+
+
+def test_foothold_placement(x2):
+    # the left foot comes down 8 cm from its candidate: exp(-0.08 / 0.08); the right is in the air
+    touchdown = {"first_contact": [True, False], "foothold_distance": [0.08, 0.0]}
+    check(x2, "foothold_placement", math.exp(-1.0), **touchdown)
+    check(x2, "foothold_placement", 2.0, first_contact=[True, True], foothold_distance=[0.0, 0.0])
+    # no candidate: nothing, and a number
+    check(x2, "foothold_placement", 0.0, first_contact=[True, True])
+
+
+def test_foot_contact_quality(x2):
+    # left: 6 samples over nothing, in contact; right: 15, in the air
+    forces = [[0.0, 0.0, 300.0], [0.0, 0.0, 0.0]]
+    check(x2, "foot_contact_quality", 6.0, unsupported=[6, 15], foot_force=forces)
 
 
 def test_linear_velocity_tracking(x2):
@@ -270,7 +288,8 @@ def test_stumble(x2):
 
 def test_a_perfect_stand_has_every_reward_and_no_penalty(x2):
     _, parts = reward.total(perfect(x2), C, x2)
-    expected = {name: max(weight, 0.0) for name, weight in TABLE_1.items() if name in parts}
+    weights = TABLE_1 | ALTERNATIVES | {"foothold_placement": 0.0}  # no foot comes down
+    expected = {name: max(weight, 0.0) for name, weight in weights.items()}
     assert {name: pytest.approx(float(v), abs=1e-6) for name, v in parts.items()} == expected
 
 

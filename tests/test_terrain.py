@@ -201,8 +201,40 @@ def test_robots_on_different_tiles_share_one_grid():
     whole = terrain.from_heights(np.zeros((12, 10)), CELL)
     tiled = lambda r, p: terrain.closest_point(terrain.tile(whole, (6, 5), r, 0), p)
     program = str(jax.make_jaxpr(jax.vmap(tiled))(jnp.arange(2), jnp.zeros((2, 3))))
-    assert "f32[12,10]" in program
-    assert "f32[2,12,10]" not in program and "f32[2,120]" not in program
+    assert f"f32[{whole.tops.size}]" in program
+    assert f"f32[2,{whole.tops.size}]" not in program and "f32[2,12,10]" not in program
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (8, 32), (50, 77)])
+def test_a_block_is_as_high_as_its_highest_column_and_knows_whether_it_is_level(shape):
+    rng = np.random.default_rng(shape[0])
+    heights = rng.choice([-0.3, 0.0, 0.0, 0.1], (8, 8)).repeat(10, 0).repeat(10, 1)
+    heights = heights[: shape[0], : shape[1]].astype(np.float32)
+    ground = terrain.from_heights(heights, CELL)
+    i, j = np.meshgrid(*(np.arange(-3, n + 3) for n in shape), indexing="ij")
+    inner_i, inner_j = np.clip(i, 0, shape[0] - 1), np.clip(j, 0, shape[1] - 1)
+    for level, side in enumerate(terrain.BLOCKS):
+        levels = np.full(i.shape, level, np.int32)
+        top, is_level = jax.jit(terrain.block_top)(ground, levels, jnp.array(i), jnp.array(j))
+        for n in np.ndindex(i.shape):
+            a, b = inner_i[n] // side * side, inner_j[n] // side * side
+            block = heights[a : a + side, b : b + side]
+            assert is_level[n] == (np.ptp(block) == 0.0)
+            assert block.max() <= top[n] <= np.nextafter(block.max(), np.float32(np.inf))
+            assert level > 0 or top[n] == block.max()
+
+
+def test_a_tile_reads_blocks_of_the_whole_grid():
+    heights = np.arange(64 * 64, dtype=np.float32).reshape(64, 64)
+    ground = terrain.tile(terrain.from_heights(heights, CELL), (20, 20), 1, 2)
+    # column (1, 2) of the tile is (21, 42) of the grid, in the blocks from (20, 40) and (16, 32)
+    read = lambda level, i, j: float(
+        terrain.block_top(ground, jnp.int32(level), jnp.int32(i), jnp.int32(j))[0]
+    )
+    assert read(0, 1, 2) == 21 * 64 + 42
+    np.testing.assert_allclose(read(1, 1, 2), 23 * 64 + 43, rtol=1e-6)
+    np.testing.assert_allclose(read(2, 1, 2), 31 * 64 + 47, rtol=1e-6)
+    assert read(0, -50, 99) == 20 * 64 + 59  # outside of the tile its border goes on
 
 
 def test_a_sphere_has_one_or_two_planes():

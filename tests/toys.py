@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from cref_jax import config, network, ppo
+from cref_jax import config, layers, network, ppo
 
 
 class Toy(NamedTuple):
@@ -35,7 +35,7 @@ class Recaller(nn.Module):
     hidden: int = 16
 
     @nn.compact
-    def __call__(self, carry, obs, begins):
+    def __call__(self, carry, obs, begins, sight=None):
         begins = begins if self.memory else jnp.ones_like(begins)
         x = nn.elu(nn.Dense(self.hidden, name="enter")(obs))
         carry, y, _ = network.RecurrentFusion(self.hidden, name="recurrent")(carry, x, begins)
@@ -57,7 +57,7 @@ CUES = jnp.array([-1.0, 1.0])
 def solve(toy: Toy, c: config.PPO, iterations: int, memory=True, num_envs=64, seed=0) -> Outcome:
     """Learn the toy by PPO and say how the learnt policy behaves."""
     actor, width = Recaller(memory), toy.observe(jnp.array(0), jnp.array(1.0)).size
-    value_net = network.MLP((32, 1), name="value")
+    value_net = layers.MLP((32, 1), name="value")
     networks = ppo.Networks(actor.apply, lambda p, s: value_net.apply(p, s)[..., 0])
     key_actor, key_critic, key = jax.random.split(jax.random.key(seed), 3)
     no, empty = jnp.zeros((1, 1), bool), lambda n: jnp.zeros((n, actor.hidden))

@@ -1,0 +1,235 @@
+"""Where a foot may step, Sec. II-C: windows of level ground ahead of it, frozen at liftoff.
+
+The foot frame lies at the centre of the sole and is turned by the foot's yaw alone: x forward, z
+up. F = 2 feet (left, right), K = 25 windows.
+"""
+
+from typing import NamedTuple, no_type_check
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from cref_jax import config, geometry, kinematics, terrain
+from cref_jax.kinematics import Links
+from cref_jax.robot import Robot
+from cref_jax.terrain import Terrain
+
+_PASSES = 3  # of the eigenvalue's iteration; one is exact for a plane, three for float32
+_TINY = 1e-30  # keeps 0 / 0 at 0
+
+
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@flax.struct.dataclass
+class Candidates:
+    """What each foot may step on, in its frame at its last liftoff."""
+
+    x: Float[Array, "F K"]  # m, mean of the window
+    z: Float[Array, "F K"]  # m, mean of the window
+    accepted: Bool[Array, "F K"]
+    origin: Float[Array, "F 3"]  # m, world: centre of the sole at liftoff
+    heading: Float[Array, " F"]  # rad, world: yaw of the foot at liftoff
+
+
+class Windows(NamedTuple):
+    """Mean and shape of the points in each window."""
+
+    x: Float[Array, "*n K"]  # m
+    z: Float[Array, "*n K"]  # m
+    roughness: Float[Array, "*n K"]  # m, rho: deviation from the plane that fits best
+    verticality: Float[Array, "*n K"]  # |v_1z|, of the unit normal of that plane
+
+
+class Soles(NamedTuple):
+    """Where the feet are, in the world."""
+
+    centre: Float[Array, "F 3"]  # m, of the sole
+    ankle: Float[Array, "F 3"]  # m, origin of the ankle-roll frame
+    heading: Float[Array, " F"]  # rad, yaw
+
+
+def soles(links: Links, robot: Robot) -> Soles:
+    """Return where the soles are: a sole's centre is that of its contact spheres' lowest points."""
+    spheres, ankles = robot.spheres, np.array(robot.ankles)
+    lowest = spheres.position - np.array([0.0, 0.0, 1.0], np.float32) * spheres.radius[:, None]
+    centre = np.stack([lowest[spheres.foot == foot].mean(axis=0) for foot in range(2)])
+    return Soles(
+        centre=kinematics.points(links, ankles, centre),
+        ankle=links.position[ankles],
+        heading=geometry.yaw(links.rotation[ankles]),
+    )
+
+
+def none(c: config.Foothold) -> Candidates:
+    """Return the candidates before the first liftoff of an episode: not one is accepted."""
+    shape = (2, _count(c))
+    return Candidates(
+        x=jnp.zeros(shape),
+        z=jnp.zeros(shape),
+        accepted=jnp.zeros(shape, bool),
+        origin=jnp.zeros((2, 3)),
+        heading=jnp.zeros(2),
+    )
+
+
+def candidates(
+    ground: Terrain,
+    sole: Float[Array, "F 3"],
+    heading: Float[Array, " F"],
+    forward_command: Float[Array, ""],
+    c: config.Foothold,
+) -> Candidates:
+    """Return the windows ahead of each foot, and which of them are planar, level and not recessed.
+
+        rho < r_th,    |v_1z| > eta_th,    mu_z > h_min
+
+    A window with a point nearer than half a second of the forward command does not count.
+    """
+    # foot by foot: XLA compiles one query for both into code that takes twice as long on a CPU
+    z = jnp.stack([_heights(ground, sole[foot], heading[foot], c) for foot in range(2)])
+    found = windows(z, c)
+    x, _ = _lattice(c)
+    nearest = x[: _count(c) * c.stride : c.stride]  # of the points in each window
+    accepted = (
+        (nearest >= c.gate_time * jnp.maximum(forward_command, 0.0))
+        & (found.roughness < c.roughness)
+        & (found.verticality > c.verticality)
+        & (found.z > c.min_height)
+    )
+    return Candidates(found.x, found.z, accepted, sole, heading)
+
+
+def windows(z: Float[Array, "*n X Y"], c: config.Foothold) -> Windows:
+    """Return mean, roughness and verticality of each window of points at the heights `z`.
+
+        mu = 1/n sum p_i,    Sigma = 1/max(n - 1, 1) sum (p_i - mu)(p_i - mu)^T
+        Sigma v_j = lambda_j v_j,    rho = sqrt(max(lambda_1, 0))
+
+    x and y of the points are a lattice, so only the sums with z are worked out; those of squares
+    are split into a part within the rows across the foot and a part between them.
+    """
+    x, y = _lattice(c)
+    length, width = c.window
+    if width != c.points[1]:
+        raise ValueError(f"a window must be as wide as the buffer: {width}, not {c.points[1]}")
+    columns = [z[..., j] for j in range(width)]  # summed one by one: a reduction over 5 is slow
+    row_z = sum(columns, start=jnp.zeros(())) / width
+    off_row = [column - row_z for column in columns]
+    row_y = sum(off * float(at) for off, at in zip(off_row, y, strict=True))
+
+    rows = c.stride * np.arange(_count(c))[:, None] + np.arange(length)  # of each window
+    mean_z = _summed(row_z, c) / length
+    dz = row_z[..., rows] - mean_z[..., None]
+    dx = x[:length] - x[:length].mean()
+    divisor = max(length * width - 1, 1)
+    xx, yy = width * float(np.sum(dx**2)) / divisor, length * float(np.sum(y**2)) / divisor
+    xz = width * jnp.sum(dx * dz, axis=-1) / divisor
+    yz = _summed(row_y, c) / divisor
+    within = _summed(sum(jnp.square(off) for off in off_row), c)
+    zz = (width * jnp.square(dz).sum(axis=-1) + within) / divisor
+
+    smallest, verticality = _flattest((xx, xz), (yy, yz), zz)
+    mean_x = x[:length].mean() + c.stride * c.spacing[0] * np.arange(_count(c))
+    return Windows(
+        x=jnp.broadcast_to(jnp.asarray(mean_x, jnp.float32), mean_z.shape),
+        z=mean_z,
+        roughness=jnp.sqrt(jnp.maximum(smallest, 0.0)),
+        verticality=verticality,
+    )
+
+
+def updated(before: Candidates, now: Candidates, lifted: Bool[Array, " F"]) -> Candidates:
+    """Return the new candidates of the feet that have just lifted off, and the old of the others.
+
+    A foot's candidates stay where they are in the world until its next liftoff.
+    """
+    choose = lambda new, old: jnp.where(lifted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    return jax.tree.map(choose, now, before)
+
+
+def distance(frozen: Candidates, sole: Float[Array, "F 3"]) -> Float[Array, " F"]:
+    """d_xz, m: from each sole's centre to the nearest accepted candidate, across y not counted.
+
+    It is infinite where none is accepted.
+    """
+    moved = geometry.rotate_yaw(-frozen.heading, sole - frozen.origin)
+    square = jnp.square(moved[:, :1] - frozen.x) + jnp.square(moved[:, 2:] - frozen.z)
+    return jnp.sqrt(jnp.where(frozen.accepted, square, jnp.inf).min(axis=-1))
+
+
+def points(frozen: Candidates) -> Float[Array, "F K 3"]:
+    """Return the accepted candidates in the world, m, to be drawn; NaN where one is refused."""
+    ahead = jnp.stack([frozen.x, jnp.zeros_like(frozen.x), frozen.z], axis=-1)
+    place = frozen.origin[:, None] + geometry.rotate_yaw(frozen.heading[:, None], ahead)
+    return jnp.where(frozen.accepted[..., None], place, jnp.nan)
+
+
+def unsupported(ground: Terrain, feet: Soles, c: config.Foothold) -> Int[Array, " F"]:
+    """Return how many of each sole's samples are over nothing: d_ij = z_ground - z_sole < epsilon.
+
+    After BeamDojo (arXiv 2502.10363). The samples lie about the ankle's origin, turned by the
+    foot's yaw; z_sole is the centre's.
+    """
+    grid = np.stack(np.meshgrid(np.linspace(*c.quality_x), np.linspace(*c.quality_y)), axis=-1)
+    offsets = jnp.asarray(grid.reshape(-1, 2), jnp.float32)
+    points = geometry.rotate_yaw(feet.heading[:, None], offsets) + feet.ankle[:, None, :2]
+    depth = terrain.height_at(ground, points) - feet.centre[:, 2:]
+    return jnp.sum(depth < c.quality_depth, axis=-1)
+
+
+def _count(c: config.Foothold) -> int:
+    """Return the number of windows, K."""
+    return (c.points[0] - c.window[0]) // c.stride + 1
+
+
+def _lattice(c: config.Foothold) -> tuple[Float[np.ndarray, " X"], Float[np.ndarray, " Y"]]:
+    """Return x and y of the buffer's points in the foot frame, m: x from half a spacing on."""
+    x = (np.arange(c.points[0]) + 0.5) * c.spacing[0]
+    y = (np.arange(c.points[1]) - 0.5 * (c.points[1] - 1)) * c.spacing[1]
+    return x.astype(np.float32), y.astype(np.float32)
+
+
+def _heights(
+    ground: Terrain, sole: Float[Array, "3"], heading: Float[Array, ""], c: config.Foothold
+) -> Float[Array, "X Y"]:
+    """Return the ground's height above the sole at each point of one foot's buffer, m."""
+    grid = np.stack(np.meshgrid(*_lattice(c), indexing="ij"), axis=-1).reshape(-1, 2)
+    points = sole[:2] + geometry.rotate_yaw(heading, jnp.asarray(grid))
+    return (terrain.height_at(ground, points) - sole[2]).reshape(c.points)
+
+
+def _summed(of_rows: Float[Array, "*n X"], c: config.Foothold) -> Float[Array, "*n K"]:
+    """Return the sum over the rows of each window."""
+    one = (1,) * (of_rows.ndim - 1)
+    return jax.lax.reduce_window(
+        of_rows, 0.0, jax.lax.add, (*one, c.window[0]), (*one, c.stride), "valid"
+    )
+
+
+def _flattest(
+    along: tuple[float, Float[Array, "*n"]],
+    across: tuple[float, Float[Array, "*n"]],
+    zz: Float[Array, "*n"],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Return lambda_1 of the covariance [[a, 0, p], [0, b, q], [p, q, zz]] and |v_1z|.
+
+    `along` is (a, p) and `across` (b, q). With b <= a, lambda_1 is the one root up to b of
+
+        zz - s - h(s) - q^2 / (b - s) = 0,    h(s) = p^2 / (a - s)
+
+    and v_1 ~ (-p / (a - s), -q / (b - s), 1). Each pass puts h's tangent in the place of h, which
+    leaves a quadratic equation for b - s; from the first on, s comes down on the root from above.
+    """
+    (b, q), (a, p) = sorted((along, across), key=lambda pair: pair[0])
+    s, gap = jnp.zeros_like(zz), jnp.full_like(zz, b)  # b - s
+    for _ in range(_PASSES):
+        slope = jnp.square(p / (a - s))  # of h
+        corner = (zz - jnp.square(p) / (a - s) + slope * s) / (1.0 + slope)
+        half = 0.5 * (b - corner)
+        gap = half + jnp.sqrt(jnp.square(half) + jnp.square(q) / (1.0 + slope))
+        s = b - gap
+    slope = jnp.square(p / (a - s))
+    length = jnp.square(gap) * (1.0 + slope) + jnp.square(q)
+    return s, gap / jnp.sqrt(jnp.maximum(length, _TINY))

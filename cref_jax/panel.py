@@ -1,0 +1,86 @@
+"""The picture of what the policy sees and does, beside that of the world."""
+
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+WIDTH = 320  # pixels
+SECONDS = 4.0  # of the gate's history that are shown
+DEPTHS = "turbo_r"  # matplotlib's colours from near to far
+INK, PAPER, FAINT = (40, 40, 44), (250, 250, 248), (205, 205, 205)
+BAND, LINE = (190, 210, 235), (30, 90, 170)
+MARGIN = 12  # pixels
+TITLE = 20  # pixels, height of a line of text
+
+Picture = UInt8[np.ndarray, "height width 3"]
+
+
+class Mind(NamedTuple):
+    """What is shown of the policy, up to one moment."""
+
+    depth: Float[np.ndarray, "H W"] | None  # D, normalised; None: nothing has been seen yet
+    attention: Float[np.ndarray, " N"] | None  # weights of the tokens, mean over the heads
+    gates: Float[np.ndarray, "t D"]  # beta of each step so far
+
+
+def draw(mind: Mind, height: int, d_max: float, period: float, sees: bool) -> Picture:
+    """Return the panel; `period` lies between two rows of the gates, s.
+
+    Without `sees` the policy is blind, and the gate is all there is to show.
+    """
+    picture = Image.new("RGB", (WIDTH, height), PAPER)
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    inner, top = WIDTH - 2 * MARGIN, MARGIN
+    if sees:
+        pen.text((MARGIN, top), f"depth, 0 to {d_max:g} m: near is red", INK, font)
+        size = (inner, inner * 3 // 4)
+        picture.paste(_depth(mind.depth, size), (MARGIN, top + TITLE))
+        top += TITLE + size[1] + MARGIN
+        pen.text((MARGIN, top), "attention, mean of the heads", INK, font)
+        size = (inner // 2, inner * 3 // 8)
+        picture.paste(_attention(mind.attention, size), (MARGIN, top + TITLE))
+        top += TITLE + size[1] + MARGIN
+    pen.text((MARGIN, top), "highway gate: 1 leans on memory", INK, font)
+    _gate(pen, mind.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
+    return np.asarray(picture)
+
+
+def _depth(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
+    if depth is None:
+        return Image.new("RGB", size, FAINT)
+    colours = matplotlib.colormaps[DEPTHS](np.clip(depth + 0.5, 0.0, 1.0), bytes=True)
+    return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
+
+
+def _attention(weights: Float[np.ndarray, " N"] | None, size: tuple[int, int]) -> Image.Image:
+    """Return the tokens' weights where they lie in the image, brightest at the largest."""
+    if weights is None:
+        return Image.new("RGB", size, FAINT)
+    rows = round((len(weights) * 3 / 4) ** 0.5)
+    grid = (weights / weights.max()).reshape(rows, -1)
+    colours = matplotlib.colormaps["magma"](grid, bytes=True)
+    return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
+
+
+def _gate(
+    pen: ImageDraw.ImageDraw,
+    gates: Float[np.ndarray, "t D"],
+    box: tuple[int, int, int, int],
+    period: float,
+) -> None:
+    """Draw the mean of the gate's channels and the band of the middle 80 % over time."""
+    left, top, right, bottom = box
+    shown = gates[-max(2, round(SECONDS / period)) :]
+    span = max(1, round(SECONDS / period) - 1)
+    x = right - (right - left) * (len(shown) - 1 - np.arange(len(shown))) / span
+    y = lambda value: bottom - (bottom - top) * value
+    low, high = np.percentile(shown, (10, 90), axis=1)
+    for value in (0.0, 0.5, 1.0):
+        pen.line([(left, y(value)), (right, y(value))], FAINT)
+    if len(shown) > 1:
+        edge = [*zip(x, y(high), strict=True), *zip(x[::-1], y(low[::-1]), strict=True)]
+        pen.polygon(edge, BAND)
+        pen.line([*zip(x, y(shown.mean(axis=1)), strict=True)], LINE, width=2)

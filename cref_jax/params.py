@@ -1,0 +1,56 @@
+"""Count the parameters of each variant of the network: `python -m cref_jax.params`."""
+
+import typing
+from dataclasses import dataclass
+
+import jax
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from cref_jax import cli, config, learn, runs
+from cref_jax.config import Config
+
+
+@dataclass(frozen=True)
+class Options:
+    """Count the parameters of each variant, by part."""
+
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line."""
+    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.params")
+    with cli.one_line_errors(options.debug):
+        Console().print(table({name: count(name) for name in typing.get_args(config.Variant)}))
+
+
+def count(variant: config.Variant) -> dict[str, int]:
+    """Return the number of parameters of each part of the actor, and of the critic."""
+    c = config.override(Config(), {"network": {"variant": variant}, "run": {"num_envs": 4}})
+    params = jax.eval_shape(learn.initial_state, runs.world_of(c)).train.params
+    size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))
+    parts = {part: size(tree) for part, tree in params.actor["params"].items()}
+    return {**parts, "critic": size(params.critic)}
+
+
+def table(counts: dict[str, dict[str, int]]) -> Table:
+    """Return the counts, a column for each variant."""
+    found = Table(title="parameters")
+    found.add_column("part")
+    for variant in counts:
+        found.add_column(variant, justify="right")
+    parts = sorted({part for parts in counts.values() for part in parts} - {"critic"})
+    for part in parts:
+        found.add_row(part, *(f"{c[part]:,}" if part in c else "-" for c in counts.values()))
+    found.add_section()
+    policy = {v: sum(c.values()) - c["critic"] for v, c in counts.items()}
+    found.add_row("policy", *(f"{total:,}" for total in policy.values()))
+    found.add_row("critic", *(f"{c['critic']:,}" for c in counts.values()))
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Draw what the robot sees: `python experiments/depth.py --out experiments/depth.png`.
+
+It stands at the nominal pose, 0.6 m before the first obstacle of each kind of lane, with one of
+the middle sizes; at last it lifts a knee into the view. Takes seconds.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+from cref_jax import config, depth, kinematics, lanes, robot, terrain
+
+BEFORE = 0.6  # m, from the pelvis to the first column that is not at z = 0
+LEVEL = 5  # of 0 to 9
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw the depth image of each kind of terrain."""
+
+    out: Path = Path("depth.png")
+    """the picture to write"""
+
+
+def main() -> None:
+    """Render one image a kind and draw them side by side."""
+    options = tyro.cli(Options)
+    c = config.Config()
+    atlas = lanes.build(config.Terrain(name="mixed"))
+    figure, axes = plt.subplots(2, 4, figsize=(11, 4.6), constrained_layout=True)
+    views = {
+        f"{name}, {atlas.sizes[LEVEL, kind]:.2f}" + " m" * (name != "slope"): view(
+            c, atlas.tile(LEVEL, kind), lift=0.0
+        )
+        for kind, name in enumerate(atlas.kinds)
+    }
+    views["a knee lifted"] = view(c, atlas.tile(LEVEL, atlas.kinds.index("flat")), lift=1.0)
+    for axis, (title, seen) in zip(axes.flat, views.items(), strict=True):
+        image = axis.imshow(seen, cmap="viridis_r", vmin=0.5, vmax=c.camera.d_max)
+        axis.set_title(title)
+        axis.set_axis_off()
+    figure.colorbar(image, ax=axes, label="depth, m")
+    figure.savefig(options.out, dpi=110)
+    print(f"wrote {options.out}")
+
+
+def view(c: config.Config, ground: terrain.Terrain, lift: float) -> np.ndarray:
+    """Return the depth image, m, before the first obstacle, one hip bent by `lift`, rad."""
+    x2 = robot.load(c.robot)
+    x = np.arange(0.0, 6.0, ground.cell) + 0.5 * ground.cell
+    heights = np.asarray(terrain.height_at(ground, jnp.stack([x, 0.0 * x], 1)))
+    obstacle = x[np.argmax(heights != 0.0)] if heights.any() else 1.5
+    base = [obstacle - BEFORE, 0.0, x2.standing_height, 1.0, 0.0, 0.0, 0.0]
+    bent = lift * np.array([name == "left_hip_pitch_joint" for name in x2.joint_names])
+    qpos = jnp.concatenate([jnp.array(base), x2.nominal_pose - bent])
+    tree = kinematics.tree(robot.spec(c.robot.actuated, c.physics).compile())
+    links = kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1))
+    position, rotation = depth.pose(links, x2.camera, c.camera, 0.0, jnp.zeros(3))
+    capsules = depth.capsules_in_view(links, x2.capsules)
+    return np.asarray(depth.render(ground, position, rotation, capsules, c.camera))
+
+
+if __name__ == "__main__":
+    main()
