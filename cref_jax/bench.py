@@ -20,11 +20,25 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, config, env, learn, ppo, rollout, runs
+from cref_jax import (
+    cli,
+    config,
+    depth,
+    env,
+    foothold,
+    lanes,
+    learn,
+    peers,
+    ppo,
+    rollout,
+    runs,
+)
+from cref_jax.config import Config
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.world import World
 
 STEPS = 12  # control steps of one timed call
+FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
 
 
 @dataclass(frozen=True)
@@ -39,6 +53,8 @@ class Options:
     """the best of so many is taken"""
     engines: tuple[EngineName, ...] = ("mujoco", "mjx")
     """engines to compare"""
+    depth: bool = True
+    """compare the depth camera with NVIDIA Warp's ray-cast, too, if that is installed"""
     out: Path | None = None
     """write the figures as JSON, too"""
     debug: bool = False
@@ -49,6 +65,7 @@ class Row(NamedTuple):
     """One measured stage."""
 
     stage: str
+    robots: int
     seconds: float  # for one control step of all robots
     compile_seconds: float
 
@@ -59,15 +76,16 @@ def main() -> None:
     with cli.one_line_errors(options.debug):
         cli.prepare()
         rows = measure(options)
-        show(options, rows)
+        speeds = compare_depth(options) if options.depth else []
+        show(options, rows, speeds)
         if options.out:
-            options.out.write_text(json.dumps(as_json(options, rows), indent=2) + "\n")
+            options.out.write_text(json.dumps(as_json(options, rows, speeds), indent=2) + "\n")
 
 
 def measure(options: Options) -> list[Row]:
     """Return every stage's time."""
     c = config.override(
-        config.Config(),
+        Config(),
         {
             "terrain": {"name": options.terrain},
             "run": {"num_envs": options.num_envs},
@@ -84,53 +102,72 @@ def measure(options: Options) -> list[Row]:
             )
             rows.append(_timed(f"environment step, {engine}", _steps, options, world, robots))
             rows.append(_timed(f"physics, {engine}", _physics, options, world, robots))
-    main_engine = resolve_engine("auto")
     with console.status("learner: compiling and timing"):
-        world = runs.world_of(c, main_engine)
+        world = runs.world_of(c, resolve_engine("auto"))
         state = jax.jit(learn.initial_state)(world)
         rows.append(_timed("terrain query", _queries, options, world, state.robots))
+        rows.append(_timed("depth, 20 Hz", _frames, options, world, state.robots))
+        rows.append(_timed(FOOTHOLD, _footholds, options, world, state.robots))
         rows.append(_timed("policy", _policy, options, world, state))
         rows.append(_timed("update, one epoch", _update, options, world, state))
+    with console.status("whole iteration: compiling and timing"):
+        rows.append(_iteration(options))
     return rows
 
 
-def show(options: Options, rows: list[Row]) -> None:
-    """Print the table and the ratios that the design promises."""
-    table = Table(title=f"{options.num_envs} robots, {options.terrain}, {_machine()}")
-    for column in ("stage", "ms a control step", "robot steps/s", "compiled in s"):
+def compare_depth(options: Options) -> list[peers.Speed]:
+    """Return the speed of the depth camera and of NVIDIA Warp's ray-cast, on a flight of stairs."""
+    c = config.override(Config(), {"terrain": {"name": "stairs"}})
+    lane = lanes.single(c.terrain, "stairs_up", 0.15)
+    with Console().status("depth: compiling and timing"):
+        return peers.compare(lane.tile(0, 0), c.camera, lane.is_profile[0])
+
+
+def show(options: Options, rows: list[Row], speeds: list[peers.Speed]) -> None:
+    """Print the tables and the ratios that the design promises."""
+    table = Table(title=f"{options.terrain}, {_machine()}")
+    for column in ("stage", "robots", "ms a control step", "robot steps/s", "compiled in s"):
         table.add_column(column, justify="left" if column == "stage" else "right")
     for row in rows:
-        rate = options.num_envs / row.seconds
-        table.add_row(
-            row.stage, f"{1e3 * row.seconds:.2f}", f"{rate:,.0f}", f"{row.compile_seconds:.1f}"
-        )
+        times = f"{1e3 * row.seconds:.2f}", f"{row.robots / row.seconds:,.0f}"
+        table.add_row(row.stage, str(row.robots), *times, f"{row.compile_seconds:.1f}")
     console = Console()
     console.print(table)
     for name, ratio in ratios(rows).items():
-        console.print(f"{name}: {ratio:.2f}")
+        console.print(f"{name}: {ratio:,.3g}")
+    if not speeds:
+        return
+    table = Table(title="depth images of stairs, 64 x 48")
+    for column in ("renderer", "frames/s", "threads", "pixels within 1 cm"):
+        table.add_column(column, justify="left" if column == "renderer" else "right")
+    for s in speeds:
+        table.add_row(s.renderer, f"{s.frames_per_second:,.0f}", s.threads, f"{s.agreement:.1%}")
+    console.print(table)
 
 
 def ratios(rows: list[Row]) -> dict[str, float]:
     """Return the comparisons, as far as their stages were measured."""
-    seconds = {row.stage: row.seconds for row in rows}
-    c_step, mjx_step = (seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx"))
+    seconds = {row.stage: row.seconds / row.robots for row in rows}
+    steps = {e: seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx")}
     found = {}
-    if c_step and mjx_step:
-        found["engine mujoco over engine mjx, environment steps/s"] = mjx_step / c_step
-    fastest = min((s for s in (c_step, mjx_step) if s), default=None)
+    if steps["mujoco"] and steps["mjx"]:
+        gain = steps["mjx"] / steps["mujoco"]
+        found["engine mujoco over engine mjx, environment steps/s"] = gain
+    fastest = min((s for s in steps.values() if s), default=None)
     if fastest:
         found["terrain query, share of an environment step"] = seconds["terrain query"] / fastest
+    found["foothold reward, share of an iteration"] = seconds[FOOTHOLD] / seconds[ITERATION]
     return found
 
 
-def as_json(options: Options, rows: list[Row]) -> dict[str, Any]:
+def as_json(options: Options, rows: list[Row], speeds: list[peers.Speed]) -> dict[str, Any]:
     """Return all figures with where they were measured."""
     return {
         "machine": _machine(),
-        "num_envs": options.num_envs,
         "terrain": options.terrain,
         "rows": [row._asdict() for row in rows],
         "ratios": ratios(rows),
+        "depth": [speed._asdict() for speed in speeds],
     }
 
 
@@ -144,12 +181,37 @@ def _timed(stage: str, make: Callable[..., Any], options: Options, *arguments: A
     begun = time.perf_counter()
     program = jax.jit(make).lower(*arguments).compile()
     compiled = time.perf_counter() - begun
+    seconds = _best(lambda: program(*arguments), options.repeats)
+    return Row(stage, options.num_envs, seconds / STEPS, compiled)
+
+
+def _best(call: Callable[[], Any], repeats: int) -> float:
+    """Return the shortest time of several calls, s; one before them warms up."""
     times = []
-    for _ in range(options.repeats + 1):  # the first call warms up
+    for _ in range(repeats + 1):
         begun = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
+        jax.block_until_ready(call())
         times.append(time.perf_counter() - begun)
-    return Row(stage, min(times[1:]) / STEPS, compiled)
+    return min(times[1:])
+
+
+def _iteration(options: Options) -> Row:
+    """Return the time of a whole iteration of `make train`, as it is set up for this device."""
+    device = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    c = runs.composed(options.terrain, None, device)
+    world = runs.world_of(c, resolve_engine("auto"))
+    state = jax.jit(learn.initial_state)(world)
+    begun = time.perf_counter()
+    program = learn.chunk.lower(world, state, 1).compile()
+    compiled = time.perf_counter() - begun
+    run = {"state": state}  # each call consumes the state that it is given
+
+    def step() -> Any:
+        run["state"], log = program(world, run["state"])
+        return log
+
+    seconds = _best(step, options.repeats)
+    return Row(ITERATION, c.run.num_envs, seconds / c.ppo.horizon, compiled)
 
 
 def _steps(world: World, robots: rollout.Robots) -> Any:
@@ -191,6 +253,39 @@ def _queries(world: World, robots: rollout.Robots) -> Any:
 
     count = STEPS * world.config.physics.substeps
     return jax.lax.scan(query, robots.env.body, None, length=count)[0]
+
+
+def _frames(world: World, robots: rollout.Robots) -> Any:
+    """Render as many images as come in so many control steps."""
+    c = world.config
+    count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
+
+    def render(state: env.EnvState, _: None) -> tuple[env.EnvState, None]:
+        images = rollout.exposed(world, state)
+        moved = 1e-9 * images.sum(axis=(1, 2), dtype=jnp.float32)  # or it would be hoisted
+        return state.replace(camera_pitch=state.camera_pitch + moved), None
+
+    return jax.lax.scan(render, robots.env, None, length=count)[0]
+
+
+def _footholds(world: World, robots: rollout.Robots) -> Any:
+    """Find candidates and measure the distance to them, as each control step does."""
+    c = world.config.foothold
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        ground = world.lanes.tile(state.level, state.kind)
+        soles = foothold.soles(world.physics.links(body), world.physics.robot)
+        near = foothold.distance(state.candidates, soles.centre)
+        ahead = foothold.candidates(ground, soles.centre, soles.heading, state.command[0], c)
+        lost = foothold.unsupported(ground, soles, c)
+        return near.sum() + ahead.z.sum() + ahead.accepted.sum() + lost.sum()
+
+    def find(body: Any, _: None) -> tuple[Any, None]:
+        found = jax.vmap(one)(robots.env, body)
+        moved = 1e-9 * jnp.where(jnp.isfinite(found), found, 0.0)
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+
+    return jax.lax.scan(find, robots.env.body, None, length=STEPS)[0]
 
 
 def _policy(world: World, state: learn.RunState) -> Any:

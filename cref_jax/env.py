@@ -101,15 +101,19 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     return following, Outcome(seen, last.privileged, gained, ending, measures)
 
 
-def depth_image(world: World, state: EnvState) -> Float[Array, "H W"]:
-    """Return D, what the camera sees of the ground and of the robot's own links, normalised."""
+def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Float[Array, "H W"]:
+    """Return D, what the camera sees of the ground and of the robot's own links, normalised.
+
+    `is_profile` says that the robot's lane is level across: see depth.render.
+    """
     robot, camera = world.physics.robot, world.config.camera
     links = world.physics.links(state.body)
     position, rotation = depth.pose(
         links, robot.camera, camera, state.camera_pitch, state.camera_shift
     )
     capsules = depth.capsules_in_view(links, robot.capsules)
-    metres = depth.render(_ground(world, state), position, rotation, capsules, camera)
+    ground = _ground(world, state)
+    metres = depth.render(ground, position, rotation, capsules, camera, is_profile)
     return depth.normalise(metres, camera)
 
 

@@ -35,6 +35,7 @@ class Atlas:
     sizes: Float[np.ndarray | Array, "levels kinds"]  # m; m/m for a slope
     kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
     columns: tuple[int, int] = flax.struct.field(pytree_node=False)  # of the grid, along, across
+    is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # each kind: level across
 
     @property
     def levels(self) -> int:
@@ -149,7 +150,13 @@ def _atlas(c: config.Terrain, numbers: dict[str, _Numbers], sizes: np.ndarray) -
                 raise ConfigError(f"'{kind}' must leave {START} m of level ground at its start")
     grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
     origin = (0.0, -0.5 * across * c.cell)
-    return Atlas(terrain.from_heights(grid, c.cell, origin), sizes, tuple(numbers), (along, across))
+    return Atlas(
+        terrain=terrain.from_heights(grid, c.cell, origin),
+        sizes=sizes,
+        kinds=tuple(numbers),
+        columns=(along, across),
+        is_profile=tuple(bool((h == h[..., :1]).all()) for h in np.moveaxis(heights, 2, 0)),
+    )
 
 
 def _check_lane(c: config.Terrain) -> None:
@@ -263,7 +270,8 @@ def _own_map(path: Path) -> Atlas:
     heights = (heights - heights[start]) * file.scale
     origin = (MAP_START - file.start[0], -file.start[1])
     grid = terrain.from_heights(heights.astype(np.float32), file.cell, origin)
-    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape)
+    is_profile = bool((heights == heights[:, :1]).all())
+    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,))
 
 
 def _array(path: Path) -> np.ndarray:

@@ -38,6 +38,23 @@ class Policy(NamedTuple):
     run: Path
 
 
+def composed(terrain: str, experiment: str | None, device: str) -> Config:
+    """Return the settings of a new run: the paper's, changed by the device and the experiment.
+
+    Raises:
+        ConfigError: an unknown experiment, or a file that cannot be used.
+    """
+    c = config.override(Config(), {"terrain": {"name": terrain}})
+    preset = config.load_toml(_experiment("presets")).get(device, {})
+    for_terrain = preset.pop(terrain, {})
+    known = {f.name for f in dataclasses.fields(Config)}
+    c = config.override(c, {k: v for k, v in preset.items() if k in known})
+    c = config.override(c, for_terrain)
+    if experiment:
+        c = config.override(c, config.load_toml(_experiment(experiment)))
+    return c
+
+
 def write_config(run: Path, c: Config) -> None:
     """Write every setting of the run."""
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
@@ -143,6 +160,17 @@ def load_policy(run: Path, world: World) -> Policy:
         newest = steps.latest()
         train = steps.restore_part("train", like, newest)
         return Policy(c, train, newest or 0, run)
+
+
+def _experiment(name: str) -> Path:
+    """Return the file of an experiment, given by its name or as a path."""
+    if name.endswith(".toml"):
+        return Path(name)
+    folder = data_folder("experiments")
+    known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "presets")
+    if name not in (*known, "presets"):
+        raise ConfigError(config.unknown("experiment", name, known))
+    return folder / f"{name}.toml"
 
 
 def _main_memory() -> int:

@@ -95,25 +95,12 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         options = dataclasses.replace(options, run_dir=run)
         base = runs.read_config(run)
     else:
-        base = composed(options)
+        base = runs.composed(options.terrain, options.experiment, options.device)
     default = Command(options, base)
     command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
     c = _with_short_options(command.settings, command.options)
     config.check(c)
     return dataclasses.replace(command.options, device=options.device), c
-
-
-def composed(options: Options) -> Config:
-    """Return the settings before the command line has its say."""
-    c = config.override(Config(), {"terrain": {"name": options.terrain}})
-    preset = config.load_toml(_experiment("presets")).get(options.device, {})
-    for_terrain = preset.pop(options.terrain, {})
-    known = {f.name for f in dataclasses.fields(Config)}
-    c = config.override(c, {k: v for k, v in preset.items() if k in known})
-    c = config.override(c, for_terrain)
-    if options.experiment:
-        c = config.override(c, config.load_toml(_experiment(options.experiment)))
-    return c
 
 
 def select_device(device: Device) -> Literal["cpu", "gpu"]:
@@ -285,17 +272,6 @@ def _with_short_options(c: Config, options: Options) -> Config:
     short = {name: getattr(options, name) for name in ("num_envs", "iterations", "seed")}
     given = {name: value for name, value in short.items() if value is not None}
     return dataclasses.replace(c, run=dataclasses.replace(c.run, **given))
-
-
-def _experiment(name: str) -> Path:
-    """Return the file of an experiment, given by its name or as a path."""
-    if name.endswith(".toml"):
-        return Path(name)
-    folder = runs.data_folder("experiments")
-    known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "presets")
-    if name not in (*known, "presets"):
-        raise ConfigError(config.unknown("experiment", name, known))
-    return folder / f"{name}.toml"
 
 
 def _name(options: Options) -> str:

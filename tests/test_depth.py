@@ -156,6 +156,32 @@ def test_a_lane_looks_as_mujocos_rays_see_it(kind):
         assert np.ptp(image) > 0.2
 
 
+@pytest.mark.parametrize("kind", [kind for kind in LANES if kind != "rough"])
+def test_a_profile_is_swept_as_it_is_marched(kind):
+    atlas = lanes.single(config.Terrain(name="mixed", lane_width=1.0), kind, LANES[kind])
+    assert atlas.is_profile == (True,)
+    ground = atlas.tile(0, 0)
+    sweep = jax.jit(functools.partial(depth.render, camera=CAMERA, is_profile=True))
+    rng = np.random.default_rng(len(kind))
+    for x in (-0.3, 0.9, 2.4, 5.0, 11.5):  # the first and the last see past the lane's ends
+        place = np.array([x, rng.uniform(-0.3, 0.3)])
+        over = terrain.height_at(ground, place) + rng.uniform(0.3, 1.2)
+        position, rotation = np.array([*place, over], np.float32), around_pose(rng)
+        marched = see(ground, position, rotation)
+        swept = np.asarray(sweep(ground, position, rotation.astype(np.float32), NONE))
+        # but for rays that graze an edge the two are one
+        assert np.mean(abs(swept - marched) < 1e-4) > 0.998
+        edge = np.ptp(np.lib.stride_tricks.sliding_window_view(marched, (3, 3)), (2, 3)) > 0.02
+        np.testing.assert_allclose(swept[1:-1, 1:-1][~edge], marched[1:-1, 1:-1][~edge], atol=1e-4)
+
+
+def test_only_a_lane_that_is_level_across_is_a_profile():
+    c = config.Terrain(name="mixed", lane_width=1.0, levels=2)
+    atlas = lanes.build(c)
+    level = dict(zip(atlas.kinds, atlas.is_profile, strict=True))
+    assert not level.pop("rough") and all(level.values())
+
+
 @pytest.mark.parametrize(
     "shape, cell", [((11, 9), 0.1), ((40, 33), 0.02), ((1, 1), 0.05), ((5, 64), 0.05)]
 )

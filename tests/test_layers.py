@@ -21,7 +21,7 @@ LAYERS = [
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel"},
-    {"runs"},
+    {"runs", "peers"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

@@ -91,9 +91,11 @@ def test_settings_come_from_defaults_then_device_then_experiment_then_command_li
 
 
 @pytest.mark.slow
-def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path):
-    run(tmp_path / "straight", "--iterations", "4", "--run.chunk", "2")
-    run(tmp_path / "halves", "--iterations", "2")
+@pytest.mark.parametrize("variant", ["blind", "full"])
+def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, variant: str):
+    settings = ("--network.variant", variant)
+    run(tmp_path / "straight", "--iterations", "4", "--run.chunk", "2", *settings)
+    run(tmp_path / "halves", "--iterations", "2", *settings)
     run(tmp_path / "halves", "--iterations", "4", "--resume")
     straight, halves = state_of(tmp_path / "straight"), state_of(tmp_path / "halves")
     assert all(np.array_equal(a, b) for a, b in zip(straight, halves, strict=True))

@@ -1,0 +1,194 @@
+"""NVIDIA Warp's ray-cast of the scene that our depth camera sees, to compare the two.
+
+Warp is a dependency of the benchmark alone: `pip install 'cref-jax[bench]'`. On a CPU its kernels
+run on one thread.
+"""
+
+import importlib.util
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from cref_jax import config, depth, scene
+from cref_jax.terrain import Terrain
+
+CAMERAS = 256
+REPEATS = 8
+HEIGHT = (1.0, 1.3)  # m, of the cameras over the ground
+TURN = 0.2  # rad, +-, yaw, pitch and roll about the mount's pose
+TILE = 50  # columns, side of the largest box of the mesh of boxes
+
+
+class Mesh(NamedTuple):
+    """Triangles."""
+
+    points: Float[np.ndarray, "P 3"]  # m
+    triangles: Int[np.ndarray, "T 3"]
+
+
+class Speed(NamedTuple):
+    """How quick a renderer is."""
+
+    renderer: str
+    frames_per_second: float
+    threads: str
+    agreement: float  # share of pixels within 1 cm of the march over the columns
+
+
+def compare(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Speed]:
+    """Return the speed of our renderers and of Warp's ones, if it is installed, on one lane."""
+    position, rotation = _poses(ground, camera)
+    found, reference = [], None
+    for sweeps in (False, True) if is_profile else (False,):
+        seconds, images = _ours(ground, position, rotation, camera, sweeps)
+        reference = images if reference is None else reference
+        name = "sweep of the profile" if sweeps else "march over the columns"
+        found.append(_speed(name, seconds, "all", images, reference))
+    if importlib.util.find_spec("warp") is None:
+        return found
+    heights, origin = scene.window(ground)
+    meshes = {
+        "boxes": box_mesh(heights, origin, ground.cell),
+        "grid": grid_mesh(heights, origin, ground.cell),
+    }
+    for name, mesh in meshes.items():
+        seconds, images = _warp(mesh, position, rotation, camera)
+        title = f"NVIDIA Warp, {len(mesh.triangles):,} triangles ({name})"
+        found.append(_speed(title, seconds, "1", images, reference))
+    return found
+
+
+def box_mesh(
+    heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
+) -> Mesh:
+    """Return a box for each rectangle of columns of one height: vertical risers, few triangles."""
+    boxes = scene.boxes(heights, TILE, most=heights.size)
+    assert boxes is not None
+    low = float(heights.min()) - scene.BASE
+    sides = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    quads = sides[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+    points, triangles = [], []
+    for first, size, height in zip(boxes.first, boxes.size, boxes.height, strict=True):
+        (x0, y0), (x1, y1) = origin + first * cell, origin + (first + size) * cell
+        triangles.append(quads + 8 * len(points))
+        points.append([(x, y, z) for z in (low, height) for y in (y0, y1) for x in (x0, x1)])
+    return Mesh(np.concatenate(points).astype(np.float32), np.concatenate(triangles))
+
+
+def grid_mesh(
+    heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
+) -> Mesh:
+    """Return two triangles between the middles of four columns, as of a height field."""
+    x, y = (origin[k] + (np.arange(n) + 0.5) * cell for k, n in enumerate(heights.shape))
+    points = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1).reshape(-1, 3)
+    across = heights.shape[1]
+    corner = (np.arange(heights.shape[0] - 1)[:, None] * across + np.arange(across - 1)).ravel()
+    lower = np.stack([corner, corner + across, corner + 1], axis=1)
+    upper = np.stack([corner + 1, corner + across, corner + across + 1], axis=1)
+    return Mesh(points.astype(np.float32), np.concatenate([lower, upper]))
+
+
+def _poses(
+    ground: Terrain, camera: config.Camera
+) -> tuple[Float[np.ndarray, "E 3"], Float[np.ndarray, "E 3 3"]]:
+    """Return cameras all along the lane that look as they do on the robot, and a little askew."""
+    rng = np.random.default_rng(0)
+    heights, origin = scene.window(ground)
+    x = origin[0] + rng.uniform(0.05, 0.75, CAMERAS) * heights.shape[0] * ground.cell
+    columns = ((x - origin[0]) / ground.cell).astype(int)
+    z = heights[columns, heights.shape[1] // 2] + rng.uniform(*HEIGHT, CAMERAS)
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    rotation, quat, matrix = np.empty((CAMERAS, 3, 3)), np.empty(4), np.empty(9)
+    for k, (yaw, pitch, roll) in enumerate(rng.uniform(-TURN, TURN, (CAMERAS, 3))):
+        mujoco.mju_euler2Quat(quat, np.array([yaw, np.radians(camera.pitch) + pitch, roll]), "zyx")
+        mujoco.mju_quat2Mat(matrix, quat)
+        rotation[k] = matrix.reshape(3, 3) @ level
+    position = np.stack([x, np.full(CAMERAS, origin[1] + 0.5 * heights.shape[1] * ground.cell), z])
+    return position.T.astype(np.float32), rotation.astype(np.float32)
+
+
+def _ours(
+    ground: Terrain,
+    position: Float[np.ndarray, "E 3"],
+    rotation: Float[np.ndarray, "E 3 3"],
+    camera: config.Camera,
+    is_profile: bool,
+) -> tuple[float, Float[np.ndarray, "E H W"]]:
+    """Return the time of all images, s, and the images; no capsules, which Warp does not have."""
+
+    def draw(
+        ground: Terrain, position: Float[Array, "3"], rotation: Float[Array, "3 3"]
+    ) -> Float[Array, "H W"]:
+        return depth.render(ground, position, rotation, jnp.zeros((0, 7)), camera, is_profile)
+
+    program = jax.jit(jax.vmap(draw, in_axes=(None, 0, 0)))
+    images = np.asarray(program(ground, position, rotation))
+    return _best(lambda: jax.block_until_ready(program(ground, position, rotation))), images
+
+
+def _warp(
+    mesh: Mesh,
+    position: Float[np.ndarray, "E 3"],
+    rotation: Float[np.ndarray, "E 3 3"],
+    camera: config.Camera,
+) -> tuple[float, Float[np.ndarray, "E H W"]]:
+    """Return the time of all images, s, and the images."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    wp.config.quiet = True
+
+    @wp.kernel
+    def cast(
+        mesh: wp.uint64,
+        position: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
+        rotation: wp.array(dtype=wp.mat33),  # type: ignore[valid-type]
+        rays: wp.array(dtype=wp.vec3),  # type: ignore[valid-type]
+        farthest: float,
+        image: wp.array(dtype=float, ndim=2),  # type: ignore[valid-type]
+    ):
+        e, k = wp.tid()
+        hit = wp.mesh_query_ray(mesh, position[e], rotation[e] * rays[k], farthest)
+        image[e, k] = wp.where(hit.result, hit.t, farthest)
+
+    (h, w), (vertical, horizontal) = camera.shape, camera.view
+    tangent = lambda n, view: (2 * (np.arange(n) + 0.5) / n - 1) * np.tan(np.radians(view / 2))
+    x, y = np.meshgrid(tangent(w, horizontal), tangent(h, vertical))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    array = lambda values, dtype: wp.array(values, dtype=dtype, device="cpu")
+    solid = wp.Mesh(array(mesh.points, wp.vec3), array(mesh.triangles.ravel(), wp.int32))
+    image = wp.zeros((len(position), h * w), dtype=float, device="cpu")
+    inputs = [array(position, wp.vec3), array(rotation, wp.mat33), array(rays, wp.vec3)]
+    launch = lambda: wp.launch(
+        cast, image.shape, inputs=[solid.id, *inputs, camera.d_max, image], device="cpu"
+    )
+    launch()
+    return _best(launch), image.numpy().reshape(-1, h, w).copy()
+
+
+def _best(call: Callable[[], object]) -> float:
+    """Return the shortest time of several calls, s."""
+    times = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def _speed(
+    name: str,
+    seconds: float,
+    threads: str,
+    images: Float[np.ndarray, "E H W"],
+    reference: Float[np.ndarray, "E H W"],
+) -> Speed:
+    near = float(np.mean(np.abs(images - reference) < 0.01))
+    return Speed(name, len(images) / seconds, threads, near)

@@ -1,0 +1,55 @@
+"""The picture of what the policy sees and does."""
+
+import numpy as np
+
+from cref_jax import panel
+from cref_jax.panel import Mind
+
+PERIOD = 0.02  # s
+HEIGHT = 540
+
+
+def drawn(mind, sees=True):
+    return panel.draw(mind, HEIGHT, d_max=3.0, period=PERIOD, sees=sees)
+
+
+def some_mind(**changes):
+    gates = np.tile(np.linspace(0.2, 0.8, 16), (50, 1))
+    mind = Mind(np.zeros((48, 64)), np.full(48, 1 / 48), gates)
+    return mind._replace(**changes)
+
+
+def test_it_has_the_height_of_the_picture_beside_it():
+    for sees in (True, False):
+        assert drawn(some_mind(), sees).shape == (HEIGHT, panel.WIDTH, 3)
+    assert drawn(some_mind()).dtype == np.uint8
+
+
+def test_near_is_red_and_far_is_blue():
+    depth = np.full((48, 64), 0.5)  # d_max
+    depth[:, :32] = -0.4  # 0.3 m
+    image = drawn(some_mind(depth=depth)).astype(int)
+    row = image[150, panel.MARGIN + 5 : panel.WIDTH - panel.MARGIN - 5]
+    near, far = row[20], row[-20]
+    assert near[0] > 2 * near[2] and far[2] > far[0]
+
+
+def test_each_part_shows_what_it_is_given():
+    base = drawn(some_mind())
+    weights = np.zeros(48)
+    weights[5] = 1.0
+    changed = {
+        "depth": drawn(some_mind(depth=np.full((48, 64), -0.3))),
+        "attention": drawn(some_mind(attention=weights)),
+        "gates": drawn(some_mind(gates=np.full((50, 16), 0.1))),
+    }
+    rows = {
+        name: np.flatnonzero((image != base).any(axis=(1, 2))) for name, image in changed.items()
+    }
+    assert rows["depth"].max() < rows["attention"].min()
+    assert rows["attention"].max() < rows["gates"].min()
+
+
+def test_before_the_first_frame_it_is_grey_and_does_not_fail():
+    image = drawn(Mind(None, None, np.full((1, 16), 0.5)))
+    assert (image[100, 100] == panel.FAINT).all()

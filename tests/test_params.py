@@ -1,0 +1,24 @@
+"""The sizes of the networks."""
+
+import typing
+
+from cref_jax import config, params
+
+
+def test_the_count_of_each_variant_is_that_of_its_layers():
+    counts = {variant: params.count(variant) for variant in typing.get_args(config.Variant)}
+    full, d = counts["full"], 128
+    # norm 2 d, query, key, value and output d x d
+    assert full["cross_attention"] == 2 * d + 4 * d * d
+    # patches of 4 x 4 to 32, 3 x 3 x 32 to 64, 64 to d, places 48 x d, norm 2 d
+    assert full["depth_tokenizer"] == (16 * 32 + 32) + (288 * 64 + 64) + (64 * d + d) + 50 * d
+    # W_1 2d x 2d, W_2 2d x 4d, biases, norm of 2 x 2d; without the gate W_2 is 2d x 2d
+    assert full["fusion"] == (2 * d) ** 2 + 2 * d + 8 * d * d + 4 * d + 4 * d
+    assert full["fusion"] - counts["no_grf"]["fusion"] == 4 * d * d + 2 * d
+    # W_beta is 4d x 2d
+    lost = full["recurrent_fusion"] - counts["no_highway"]["recurrent_fusion"]
+    assert lost == 8 * d * d + 2 * d
+    assert {c["critic"] for c in counts.values()} == {full["critic"]}
+    assert "depth_tokenizer" not in counts["blind"]
+    table = params.table(counts)
+    assert [str(column.header) for column in table.columns] == ["part", *counts]

@@ -1,0 +1,71 @@
+"""What a run checks and composes before it begins."""
+
+from types import SimpleNamespace
+from unittest.mock import Mock
+
+import jax
+import pytest
+
+from cref_jax import runs
+from cref_jax.config import ConfigError
+
+GIB = 2**30
+
+
+def program(arguments, temporary, output=0, alias=0):
+    sizes = SimpleNamespace(
+        argument_size_in_bytes=arguments,
+        temp_size_in_bytes=temporary,
+        output_size_in_bytes=output,
+        alias_size_in_bytes=alias,
+    )
+    compiled = Mock(spec=jax.stages.Compiled)
+    compiled.memory_analysis.return_value = sizes
+    return compiled
+
+
+def test_memory_is_what_goes_in_what_comes_out_and_what_lies_between(monkeypatch):
+    monkeypatch.setattr(runs, "_main_memory", lambda: 64 * GIB)
+    # the output takes the place of the state that went in
+    assert runs.check_memory(program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB), 4096) == 8 * GIB
+
+
+def test_too_many_robots_are_refused_with_a_number_that_fits(monkeypatch):
+    monkeypatch.setattr(runs, "_main_memory", lambda: 6 * GIB)
+    # 4096 x 6 / 8 = 3072 would fit; the power of two below it is 2048
+    with pytest.raises(ConfigError, match=r"need 8.0 GiB and the device has 6.0; .* 2048"):
+        runs.check_memory(program(3 * GIB, 5 * GIB), 4096)
+
+
+def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
+    flat, gap = runs.composed("flat", None, "cpu"), runs.composed("gap", None, "cpu")
+    assert flat.network.variant == "blind" and gap.network.variant == "full"
+    assert flat.run.num_envs == gap.run.num_envs == 256
+    assert (
+        not flat.randomisation.enabled and runs.composed("gap", None, "gpu").randomisation.enabled
+    )
+
+
+@pytest.mark.parametrize(
+    ("experiment", "table", "setting", "value"),
+    [
+        ("no_cross_attention", "network", "variant", "no_cross_attention"),
+        ("no_grf", "network", "variant", "no_grf"),
+        ("no_highway", "network", "variant", "no_highway"),
+        ("blind", "network", "variant", "blind"),
+        ("full", "network", "variant", "full"),
+        ("paper", "randomisation", "enabled", False),
+    ],
+)
+def test_an_experiment_changes_what_its_name_says(experiment, table, setting, value):
+    c = runs.composed("mixed", experiment, "gpu")
+    assert getattr(getattr(c, table), setting) == value
+
+
+def test_the_reward_experiments_differ_in_the_foothold_terms_alone():
+    weights = lambda name: runs.composed("stairs", name, "gpu").reward.weights
+    none, quality = weights("no_foothold_reward"), weights("foot_contact_quality")
+    assert (none.foothold_placement, none.foot_contact_quality) == (0.0, 0.0)
+    assert quality.foothold_placement == 0.0
+    # 15 samples of a sole over nothing cost what a perfect foothold gains
+    assert 15 * quality.foot_contact_quality == pytest.approx(-2.0, abs=1e-3)
