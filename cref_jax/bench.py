@@ -181,18 +181,9 @@ def _timed(stage: str, make: Callable[..., Any], options: Options, *arguments: A
     begun = time.perf_counter()
     program = jax.jit(make).lower(*arguments).compile()
     compiled = time.perf_counter() - begun
-    seconds = _best(lambda: program(*arguments), options.repeats)
+    run = lambda: jax.block_until_ready(program(*arguments))
+    seconds = peers.shortest(run, options.repeats)
     return Row(stage, options.num_envs, seconds / STEPS, compiled)
-
-
-def _best(call: Callable[[], Any], repeats: int) -> float:
-    """Return the shortest time of several calls, s; one before them warms up."""
-    times = []
-    for _ in range(repeats + 1):
-        begun = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(time.perf_counter() - begun)
-    return min(times[1:])
 
 
 def _iteration(options: Options) -> Row:
@@ -208,9 +199,9 @@ def _iteration(options: Options) -> Row:
 
     def step() -> Any:
         run["state"], log = program(world, run["state"])
-        return log
+        return jax.block_until_ready(log)
 
-    seconds = _best(step, options.repeats)
+    seconds = peers.shortest(step, options.repeats)
     return Row(ITERATION, c.run.num_envs, seconds / c.ppo.horizon, compiled)
 
 

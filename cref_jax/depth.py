@@ -37,7 +37,7 @@ def render(
     ground reads 0; a capsule that the camera is inside of is not seen.
 
     `is_profile` promises that heights are the same all across (along y), as on stairs: the image is
-    the same, and comes ten times as fast.
+    the same, and comes eight times as fast.
     """
     height, width = camera.shape
     x, y = _slopes(width, camera.view[1]), _slopes(height, camera.view[0])

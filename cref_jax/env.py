@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cref_jax import config, depth, episode, foothold, geometry, observation, reward, terrain
 from cref_jax.episode import Ending, EnvState
+from cref_jax.foothold import Soles
 from cref_jax.kinematics import Links
 from cref_jax.observation import Observation
 from cref_jax.physics import Body
@@ -83,8 +84,9 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     force = jnp.where(unstable, 0.0, force)
 
     links = world.physics.links(body)
-    snapshot = _snapshot(world, state, body, links, force, action)
-    lived = _lived(world, state, body, links, snapshot)
+    soles = foothold.soles(links, world.physics.robot)
+    snapshot = _snapshot(world, state, body, links, soles, force, action)
+    lived = _lived(world, state, body, soles, snapshot)
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
@@ -137,6 +139,7 @@ def _snapshot(
     state: EnvState,
     body: Body,
     links: Links,
+    soles: Soles,
     force: Float[Array, "F 3"],
     action: Float[Array, " J"],
 ) -> reward.Snapshot:
@@ -148,7 +151,6 @@ def _snapshot(
     single = touching[0] ^ touching[1]
     now = observation.motion(body.qpos, body.qvel)
     across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
-    soles = foothold.soles(links, world.physics.robot)
     return reward.Snapshot(
         velocity=now.velocity,
         angular_velocity=now.angular_velocity,
@@ -174,12 +176,11 @@ def _snapshot(
     )
 
 
-def _lived(world: World, state: EnvState, body: Body, links: Links, s: reward.Snapshot) -> EnvState:
+def _lived(world: World, state: EnvState, body: Body, soles: Soles, s: reward.Snapshot) -> EnvState:
     """Return the state after the step, if the episode goes on."""
     c = world.config
     touching = reward.is_touching(s.foot_force, c.reward)
     support = reward.support_height(s.foot_z, s.foot_force, c.reward)
-    soles = foothold.soles(links, world.physics.robot)
     ahead = foothold.candidates(
         _ground(world, state), soles.centre, soles.heading, state.command[0], c.foothold
     )

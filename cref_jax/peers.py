@@ -64,6 +64,16 @@ def compare(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Sp
     return found
 
 
+def shortest(call: Callable[[], object], repeats: int) -> float:
+    """Return the shortest time of several calls, s; one before them warms up."""
+    times = []
+    for _ in range(repeats + 1):
+        begun = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begun)
+    return min(times[1:])
+
+
 def box_mesh(
     heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
 ) -> Mesh:
@@ -130,8 +140,8 @@ def _ours(
         return depth.render(ground, position, rotation, jnp.zeros((0, 7)), camera, is_profile)
 
     program = jax.jit(jax.vmap(draw, in_axes=(None, 0, 0)))
-    images = np.asarray(program(ground, position, rotation))
-    return _best(lambda: jax.block_until_ready(program(ground, position, rotation))), images
+    draw_all = lambda: jax.block_until_ready(program(ground, position, rotation))
+    return shortest(draw_all, REPEATS), np.asarray(draw_all())
 
 
 def _warp(
@@ -169,18 +179,7 @@ def _warp(
     launch = lambda: wp.launch(
         cast, image.shape, inputs=[solid.id, *inputs, camera.d_max, image], device="cpu"
     )
-    launch()
-    return _best(launch), image.numpy().reshape(-1, h, w).copy()
-
-
-def _best(call: Callable[[], object]) -> float:
-    """Return the shortest time of several calls, s."""
-    times = []
-    for _ in range(REPEATS):
-        begun = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begun)
-    return min(times)
+    return shortest(launch, REPEATS), image.numpy().reshape(-1, h, w).copy()
 
 
 def _speed(

@@ -152,7 +152,7 @@ def play(options: Options) -> None:
         recording = record(world, train, options)
         if options.stills:
             moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
-            _write_stills(out, _film(canvas, recording, moments, c))
+            _write_stills(out, _film(canvas, recording._replace(minds=None), moments, c))
         else:
             stride = max(1, round(1.0 / (FRAME_RATE * period)))
             moments = np.arange(0, len(recording.qpos), stride)

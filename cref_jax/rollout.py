@@ -72,7 +72,7 @@ class _Step(NamedTuple):
     log_std: Float[Array, "E J"]
     outcome: Outcome
     held: Int[Array, ""]  # the frame at hand, in the album
-    seen: Bool[Array, " E"]
+    seen: Bool[Array, " E"] | None  # None for a blind policy
 
 
 class Trace(NamedTuple):
@@ -96,7 +96,9 @@ def initial_params(
     one = lambda x: x[None, :1]
     carry, nets = network.initial_carry(c, 1), networks(c, num_actions)
     obs, begins = one(robots.observation.proprioception), one(robots.begins)
-    sight = robots.feed and network.Sight(one(robots.feed.frame), begins * 0, begins)
+    sight = robots.feed and network.Sight(
+        one(robots.feed.frame), jnp.zeros_like(begins, jnp.int32), begins
+    )
     return ppo.Params(
         actor=nets.actor.init(key_actor, carry, obs, begins, sight),
         critic=nets.critic.init(key_critic, one(robots.observation.privileged)),
@@ -160,7 +162,7 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E H W"]:
     """Return what all cameras see.
 
     `start` puts the robots on the kinds of lane in turn, for good: so it is known beforehand which
-    of them stand on lanes that are level across, and these images cost a tenth.
+    of them stand on lanes that are level across, and these images cost an eighth.
     """
     kinds = np.arange(state.kind.shape[0]) % len(world.lanes.kinds)
     is_profile = np.asarray(world.lanes.is_profile)[kinds]
@@ -195,7 +197,7 @@ def collect(
         action = mean + jnp.exp(policy.log_std) * jax.random.normal(key, mean.shape)
         after, outcome = advance(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
-        seen = robots.feed.seen if robots.feed is not None else robots.begins
+        seen = robots.feed and robots.feed.seen
         done = _Step(
             robots.observation, robots.begins, action, mean, log_std, outcome, watch.held, seen
         )
@@ -254,7 +256,7 @@ def _rollout(
         train.params.critic, ppo.normalise(train.statistics.critic_obs, s)
     )
     outcome, sight = steps.outcome, None
-    if album is not None:
+    if album is not None and steps.seen is not None:
         held = jnp.broadcast_to(steps.held[:, None], steps.seen.shape)
         sight = network.Sight(album, held, steps.seen)
     return ppo.Rollout(

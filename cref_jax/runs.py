@@ -142,7 +142,7 @@ def check_memory(program: jax.stages.Compiled, num_envs: int) -> int:
         fits = num_envs * there // needed
         raise ConfigError(
             f"{num_envs} robots need {needed / 2**30:.1f} GiB and the device has "
-            f"{there / 2**30:.1f}; take --num-envs {2 ** (fits.bit_length() - 1)}"
+            f"{there / 2**30:.1f}; take --num-envs {2 ** max(fits.bit_length() - 1, 0)}"
         )
     return needed
 

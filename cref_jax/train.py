@@ -157,7 +157,9 @@ class _Programs:
         if size not in self._of:
             first = not self._of
             if first:
-                self._report.say("compiling (a minute on four cores, seconds from the cache) ...")
+                self._report.say(
+                    "compiling (half a minute on four cores, seconds from the cache) ..."
+                )
             begun = time.monotonic()
             self._of[size] = learn.chunk.lower(self._world, self._shapes, size).compile()
             if first:

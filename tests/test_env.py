@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sample import ROBOTS, C, assert_equal, one, put
 
-from cref_jax import config, env, observation, reward
+from cref_jax import config, env, foothold, observation, reward
 from cref_jax.physics import Physics
 
 LENGTH = C.terrain.lane_length
@@ -148,8 +148,9 @@ def test_an_environment_alone_is_the_same_one_as_in_a_batch(world, step, robots)
 def lived(world, state, force):
     """Return the state a step later and its snapshot, had it ended with this force on the feet."""
     links = world.physics.links(state.body)
-    snapshot = env._snapshot(world, state, state.body, links, force, state.action)
-    return env._lived(world, state, state.body, links, snapshot), snapshot
+    soles = foothold.soles(links, world.physics.robot)
+    snapshot = env._snapshot(world, state, state.body, links, soles, force, state.action)
+    return env._lived(world, state, state.body, soles, snapshot), snapshot
 
 
 def test_candidates_are_found_at_liftoff_and_judged_at_touchdown(world, robots):
