@@ -11,10 +11,10 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
-.PHONY: help setup train eval play bench params test test-fast check format clean
+.PHONY: help setup train eval play export sim2sim bench params test test-fast check format clean
 
 help:
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
 setup: $(READY)  ## make .venv and install everything, with CUDA where a GPU answers
 
@@ -26,6 +26,12 @@ eval: $(READY)  ## measure success rates: ARGS="--run runs/NAME --suite table"
 
 play: $(READY)  ## watch a policy: ARGS="--run runs/NAME"
 	$(BIN)/python -m cref_jax.play $(ARGS)
+
+export: $(READY)  ## write a policy for the robot: ARGS="--run runs/NAME --out policy"
+	$(BIN)/python -m cref_jax.export $(ARGS)
+
+sim2sim: $(READY)  ## walk the whole robot in MuJoCo C: ARGS="--policy policy --kind gap --size 0.3"
+	$(BIN)/python -m cref_jax.sim2sim $(ARGS)
 
 bench: $(READY)  ## measure steps a second on this machine
 	$(BIN)/python -m cref_jax.bench $(ARGS)

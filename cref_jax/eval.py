@@ -7,7 +7,7 @@ from typing import Literal
 
 import tyro
 
-from cref_jax import cli, evaluation, runs
+from cref_jax import cli, evaluation, exported, runs
 from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 
@@ -17,7 +17,9 @@ class Options:
     """Measure how a trained policy walks."""
 
     run: Path | None = None
-    """runs/NAME; the newest one when left out"""
+    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
+    policy: Path | None = None
+    """an exported policy instead of a run"""
     suite: Literal["walk", "cross"] = "walk"
     """walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; cross: trials of up to 40 s on a
     lane with obstacles of one size"""
@@ -32,7 +34,7 @@ class Options:
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx on the device"""
     out: Path | None = None
-    """folder for eval.json; the run's own when left out"""
+    """folder for eval.json; the run's own when left out, or the present one"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -44,9 +46,9 @@ def main() -> None:
         cli.prepare()
         if options.num_envs < 1:
             raise ConfigError(f"--num-envs must be at least 1, not {options.num_envs}")
-        run = options.run or runs.newest()
-        world = runs.world_of(runs.read_config(run), options.engine)
-        policy = runs.load_policy(run, world)
+        source = exported.chosen(options.run, options.policy)
+        world = runs.world_of(exported.read_config(source), options.engine)
+        policy = exported.load(source, world)
         c, train = policy.config, policy.train
         if options.suite == "walk":
             result = evaluation.walk(c, world.physics, train, options.num_envs, options.seed)
@@ -54,12 +56,12 @@ def main() -> None:
             result = evaluation.cross(
                 c, world.physics, train, options.kind, options.size, options.num_envs, options.seed
             )
-        print(f"{run}, iteration {policy.iteration}: {result.line()}")
-        out = options.out or run
+        print(f"{source}, iteration {policy.iteration}: {result.line()}")
+        out = options.out or (source if exported.is_run(source) else Path())
         out.mkdir(parents=True, exist_ok=True)
         record = {
             "suite": options.suite,
-            "run": str(run),
+            "run": str(source),
             "iteration": policy.iteration,
             "seed": options.seed,
             **result._asdict(),

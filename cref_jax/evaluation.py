@@ -51,13 +51,15 @@ class Crossing(NamedTuple):
     successes: int  # came to the lane's end in time
     by_cause: dict[str, int]  # of the failures; timeout: it stood, or was too slow
     seconds: float  # mean time of a success
+    speed: float  # m/s forward, mean over the trials
 
     def line(self) -> str:
         """Return the outcome in one line for people."""
         causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
         return (
             f"{self.kind} {100 * self.size_m:.0f} cm: {self.successes} of {self.trials} trials "
-            f"crossed, {self.seconds:.1f} s each" + (f"; failures: {causes}" if causes else "")
+            f"crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
+            + (f"; failures: {causes}" if causes else "")
         )
 
 
@@ -65,6 +67,7 @@ class _Step(NamedTuple):
     """What one step of an episode adds to its sums."""
 
     alive: Bool[Array, " E"]
+    forward_speed: Float[Array, " E"]
     forward_error: Float[Array, " E"]
     tracking_error: Float[Array, " E"]
     airborne: Bool[Array, "E F"]
@@ -105,13 +108,13 @@ def cross(
     seed: int = 0,
 ) -> Crossing:
     """Return how often the policy's mean action comes to the end of a lane with such obstacles."""
-    c = evaluation_config(c, CROSSING_SECONDS)
-    world = make_world(c, physics).replace(lanes=lanes.single(c.terrain, kind, size))
+    world = crossing_world(c, physics, kind, size)
     steps = round(CROSSING_SECONDS / c.physics.control_period)
     key = jax.random.key(WALK_SEED + seed)
     ending, trace = jax.tree.map(np.asarray, _episodes(world, train, key, trials, steps))
     done = ending.finished & ~ending.terminated
-    seconds = trace.alive.sum(axis=0) * c.physics.control_period
+    lived = trace.alive.sum(axis=0)
+    seconds = lived * c.physics.control_period
     failures = {**ending._asdict(), "timeout": ~done & ~ending.terminated}
     return Crossing(
         kind=kind,
@@ -120,7 +123,24 @@ def cross(
         successes=int(done.sum()),
         by_cause={n: int(f.sum()) for n, f in failures.items() if n != "finished"},
         seconds=float(seconds[done].mean()) if done.any() else float("nan"),
+        speed=float((np.sum(trace.forward_speed * trace.alive, axis=0) / lived).mean()),
     )
+
+
+def crossing_world(c: Config, physics: Physics, kind: str, size: float) -> World:
+    """Return the world of the trials on one kind of lane with obstacles of one size, m."""
+    c = evaluation_config(c, CROSSING_SECONDS)
+    return make_world(c, physics).replace(lanes=lanes.single(c.terrain, kind, size))
+
+
+def starts(world: World, seed: int, count: int) -> rollout.Robots:
+    """Return the robots as the trials of this seed begin."""
+    return _starts(world, jax.random.key(WALK_SEED + seed), count)
+
+
+def _starts(world: World, key: PRNGKeyArray, count: int) -> rollout.Robots:
+    robots = rollout.start(world, key, count)
+    return robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
 
 
 @jax.jit(static_argnames=("episodes", "steps"))
@@ -129,8 +149,7 @@ def _episodes(
 ) -> tuple[Ending, _Step]:
     """Return each robot's first end, and its steps [T, E] up to there."""
     nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
-    robots = rollout.start(world, key, episodes)
-    robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
+    robots = _starts(world, key, episodes)
 
     def step(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
@@ -142,6 +161,7 @@ def _episodes(
         counted = Ending(*(flag & alive for flag in ending))
         seen = _Step(
             alive=alive,
+            forward_speed=measures.forward_speed,
             forward_error=measures.forward_command - measures.forward_speed,
             tracking_error=measures.speed_error,
             airborne=measures.airborne,

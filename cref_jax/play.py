@@ -35,6 +35,7 @@ from cref_jax import (
     cli,
     config,
     evaluation,
+    exported,
     foothold,
     lanes,
     network,
@@ -73,10 +74,11 @@ class Options:
     """Let one robot walk along a lane, without noise or pushes, and film it."""
 
     run: Path | None = None
-    """runs/NAME; the newest one when left out"""
+    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
+    policy: Path | None = None
+    """an exported policy instead of a run"""
     agent: Agent = "trained"
-    """trained: the run's policy; stand: hold the nominal pose; random: an untrained policy's noise;
-    the last two need no run"""
+    """trained: a policy; stand: hold the nominal pose; random: the noise of an untrained policy"""
     terrain: str | None = None
     """flat, rough, slope, stairs, gap, platform, mixed, or a height map; the run's when left out"""
     kind: str | None = None
@@ -141,11 +143,12 @@ def play(options: Options) -> None:
     _check(options)
     if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
         jax.config.update("jax_platforms", "cpu")
-    run = options.run or runs.newest() if options.agent == "trained" else options.run
-    c = runs.read_config(run) if run else Config()
-    out = _writable(options, run)
+    is_trained = options.agent == "trained"
+    source = exported.chosen(options.run, options.policy) if is_trained else options.run
+    c = exported.read_config(source) if source else Config()
+    out = _writable(options, source if source and exported.is_run(source) else None)
     world = _world(options, c)
-    train = runs.load_policy(run, world).train if run and options.agent == "trained" else None
+    train = exported.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
     model = scene.build(c.robot.actuated, c.physics, world.lanes.tile(0, 0))
     with scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:

@@ -65,7 +65,7 @@ def write_origin(run: Path) -> None:
     packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "command": sys.argv,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
         "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
         "cores": os.cpu_count(),
@@ -77,7 +77,7 @@ def write_origin(run: Path) -> None:
 
 
 def data_folder(name: str) -> Path:
-    """Return `experiments` or `terrains`: inside an installed package, or beside it."""
+    """Return `experiments`, `policies` or `terrains`: inside an installed package, or beside it."""
     inside = Path(__file__).parent / name
     return inside if inside.is_dir() else Path(__file__).parents[1] / name
 

@@ -12,6 +12,7 @@ from cref_jax.evaluation import _judged, _Step
 def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _Step:
     return _Step(
         alive=alive,
+        forward_speed=np.full(alive.shape, 0.5, np.float32),
         forward_error=np.full(alive.shape, error, np.float32),
         tracking_error=np.full(alive.shape, abs(error), np.float32),
         airborne=airborne,

@@ -56,9 +56,9 @@ def test_a_mistake_is_one_line(capsys, monkeypatch, tmp_path, arguments, said):
     assert said in refused(capsys, "--agent", "stand", *arguments)
 
 
-def test_a_policy_needs_a_run(capsys, monkeypatch, tmp_path):
+def test_what_is_no_policy_is_refused(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert "no trained run in runs/" in refused(capsys)
+    assert "not both" in refused(capsys, "--run", "one", "--policy", "another")
     assert "nowhere is not a run" in refused(capsys, "--run", "nowhere")
     assert list(tmp_path.iterdir()) == []
 

@@ -1,0 +1,54 @@
+"""Write a policy for the robot: `python -m cref_jax.export --run runs/NAME --out policy/`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from cref_jax import deploy  # before numpy, whose number of threads it sets
+
+# isort: split
+
+import tyro
+
+from cref_jax import cli, exported, runs
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write a trained policy as a directory that numpy alone can run."""
+
+    run: Path | None = None
+    """runs/NAME; the newest one when left out"""
+    out: Path = Path("policy")
+    """the directory; the same as one file is written to the directory's name with .zip"""
+    refresh: bool = False
+    """only give the policy that is there the runtime of this version"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.export")
+    with cli.one_line_errors(options.debug):
+        cli.prepare()
+        if options.refresh:
+            exported.refresh(options.out)
+        else:
+            _export(options)
+        times = deploy.self_test(options.out)
+        size = sum(file.stat().st_size for file in options.out.iterdir()) / 1e6
+        print(f"{options.out}: {size:.1f} MB, and says what it said in training")
+        print("\n".join(deploy.report(times)))
+        print(f"on the robot: python {options.out}/cref_runtime.py --selftest {options.out}")
+
+
+def _export(options: Options) -> None:
+    """Write the run's newest policy."""
+    run = options.run or runs.newest()
+    world = runs.world_of(runs.read_config(run), "mujoco")
+    print(f"exporting {run} ...", flush=True)
+    exported.write(runs.load_policy(run, world), world, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""An exported policy on the robot's stand-in: `python -m cref_jax.sim2sim --policy policy/`."""
+
+import concurrent.futures
+import json
+import os
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+from cref_jax import deploy  # before numpy, whose number of threads it sets
+
+# isort: split
+
+import numpy as np
+import tyro
+from rich.progress import track
+
+from cref_jax import cli, evaluation, exported, runs, scene, stand_in
+from cref_jax.config import ConfigError
+from cref_jax.evaluation import CROSSING_SECONDS, Crossing
+from cref_jax.stand_in import Lane, StandIn, Start, Trial
+from cref_jax.world import World
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let an exported policy walk all 31 joints in MuJoCo C, through deploy.py alone."""
+
+    policy: Path | None = None
+    """what `python -m cref_jax.export` wrote, or its .zip; the bundled policy when left out"""
+    kind: str = "flat"
+    """of the lane: flat, gap, stairs_up, stairs_down, platform, rough, slope"""
+    size: float = 0.0
+    """of the obstacles, m"""
+    trials: int = 100
+    """of up to 40 s"""
+    seed: int = 0
+    """of the first states and commands, which are those of `eval --suite cross`"""
+    latency: float = 0.02
+    """s from a frame's exposure until the policy has it"""
+    compare: bool = False
+    """evaluate the same trials in the training simulation, too"""
+    out: Path | None = None
+    """file for the results, .json"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.sim2sim")
+    with cli.one_line_errors(options.debug):
+        cli.prepare()
+        if options.trials < 1:
+            raise ConfigError(f"--trials must be at least 1, not {options.trials}")
+        path = options.policy or exported.bundled()
+        policy = exported.read(path)
+        physics = runs.world_of(policy.config, "mujoco").physics
+        world = evaluation.crossing_world(policy.config, physics, options.kind, options.size)
+        trials = walked(world, path, options)
+        result = crossing(trials, options)
+        print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
+        said = Counter(
+            flag.name for trial in trials for flag in deploy.Status if flag & trial.status
+        )
+        if said:
+            print("the policy said: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
+        record = {"stand_in": result._asdict(), "status": said}
+        if options.compare:
+            theirs = evaluation.cross(
+                policy.config, physics, policy.train, options.kind, options.size, options.trials,
+                options.seed,
+            )  # fmt: skip
+            print(f"training simulation, JAX:   {theirs.line()}")
+            record["training"] = theirs._asdict()
+        if options.out:
+            options.out.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def walked(world: World, path: Path, options: Options) -> list[Trial]:
+    """Return the trials of the policy there, on all cores."""
+    c, contents = world.config, deploy.contents(path)
+    joints = deploy.Policy(*contents).joints.names
+    body = StandIn(c, lane_of(world), joints)
+    latency = max(0, round(options.latency / c.physics.control_period))
+
+    def one(start: Start) -> Trial:
+        return stand_in.run(body, deploy.Policy(*contents), start, CROSSING_SECONDS, latency)
+
+    begun = starts(world, options.seed, options.trials)
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(track(pool.map(one, begun), "walking", total=len(begun), transient=True))
+
+
+def lane_of(world: World) -> Lane:
+    """Return the world's one lane."""
+    ground = world.lanes.tile(0, 0)
+    heights, origin = scene.window(ground)
+    return Lane(heights, origin, ground.cell, world.lanes.end - world.config.episode.lane_end)
+
+
+def starts(world: World, seed: int, count: int) -> list[Start]:
+    """Return poses and commands of the trials of this seed, as data."""
+    state = evaluation.starts(world, seed, count).env
+    qpos, speeds = np.asarray(state.body.qpos), np.asarray(state.command[:, 0])
+    return [Start(x[:7], x[7:], float(v)) for x, v in zip(qpos, speeds, strict=True)]
+
+
+def crossing(trials: list[Trial], options: Options) -> Crossing:
+    """Return how many came to the end."""
+    causes = Counter(trial.ending for trial in trials)
+    seconds = [trial.seconds for trial in trials if trial.ending == "finished"]
+    return Crossing(
+        kind=options.kind,
+        size_m=options.size,
+        trials=len(trials),
+        successes=causes.pop("finished", 0),
+        by_cause=dict(causes),
+        seconds=float(np.mean(seconds)) if seconds else float("nan"),
+        speed=float(np.mean([trial.speed for trial in trials])),
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""The robot's stand-in: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
+
+It knows nothing of the training simulation: the ground is boxes and not tangent planes, depth comes
+from MuJoCo's own ray-cast, the upper body is held by its motors, and the policy is run by deploy.py
+on what a robot measures. Nothing of JAX is in its loop.
+"""
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from cref_jax import config, robot, scene
+from cref_jax.config import Config, ConfigError
+from cref_jax.deploy import Policy, Status
+
+MOST_BOXES = 20_000
+MARGIN = 4.0  # m around the lane where its border goes on, as in training; further than is seen
+FAR = 1e3  # m, a ray that meets nothing
+BY_PD = Status.BAD_INPUT | Status.BAD_ACTION | Status.HOLDING | Status.DAMPING
+GROUND, SEEN, UNSEEN = 0, 1, 2  # geom groups; rays meet the first two
+
+
+class Lane(NamedTuple):
+    """The ground of a trial."""
+
+    heights: Float[np.ndarray, "X Y"]  # m, of the columns
+    origin: Float[np.ndarray, "2"]  # m, outer corner of the first column
+    cell: float  # m
+    end: float  # m along x where a trial is won; infinite on open ground
+
+
+class Start(NamedTuple):
+    """How a trial begins."""
+
+    base: Float[np.ndarray, "7"]  # m, quaternion w, x, y, z
+    q: Float[np.ndarray, " J"]  # rad, of the joints that the policy drives
+    speed: float  # m/s forward, commanded
+
+
+class Trial(NamedTuple):
+    """What became of it."""
+
+    ending: str  # tilted, low, hit, dropped, unstable, finished, timeout
+    seconds: float
+    progress: float  # m along the lane
+    speed: float  # m/s forward in the body frame, mean
+    status: Status  # everything that the policy has ever said was wrong
+    qpos: Float[np.ndarray, "T Q"]  # before each control step
+
+
+class StandIn:
+    """The compiled model of robot and ground, and where things are in it."""
+
+    def __init__(self, c: Config, lane: Lane, joints: tuple[str, ...]) -> None:
+        """Compile the model; `joints` are those that the policy drives, in its order.
+
+        Raises:
+            ConfigError: the ground needs too many boxes.
+        """
+        self.config, self.lane = c, lane
+        self.robot = robot.load(config.Robot(actuated="all"))
+        self.model = model = _spec(c, lane, self.robot).compile()
+        names = self.robot.joint_names
+        self.driven = np.array([names.index(name) for name in joints])
+        self.feet = [model.body(f"{side}_ankle_roll_link").id for side in ("left", "right")]
+        self.rays = _rays(c.camera)
+        clear = np.array(self.robot.capsules.names)[self.robot.capsules.kept_clear]
+        self.kept_clear = {model.geom(name).id for name in clear}
+
+    def image(self, state: mujoco.MjData) -> Float[np.ndarray, "H W"]:
+        """Return z-depth in metres by ray-cast, NaN where a ray meets nothing."""
+        mount, camera = self.robot.camera, self.config.camera
+        link = state.xmat[mount.body].reshape(3, 3)
+        fixed = np.zeros(9)
+        mujoco.mju_quat2Mat(fixed, mount.rotation.astype(float))
+        pitch = math.radians(camera.pitch)
+        c, s = math.cos(pitch), math.sin(pitch)
+        axes = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])  # right, down, forward
+        position = state.xpos[mount.body] + link @ mount.position
+        world = self.rays @ (link @ fixed.reshape(3, 3) @ axes).T
+        count = len(world)
+        found, distance = np.zeros(count, np.int32), np.zeros(count)
+        groups = np.array([g in (GROUND, SEEN) for g in range(6)], np.uint8)
+        mujoco.mj_multiRay(
+            self.model, state, position, world.ravel(), groups, True, -1, found, distance,
+            None, count, FAR,
+        )  # fmt: skip
+        depth = np.where(distance < 0.0, np.nan, distance * self.rays[:, 2])
+        return depth.reshape(camera.shape).astype(np.float32)
+
+    def feet_on_ground(self, state: mujoco.MjData) -> tuple[Float[np.ndarray, "2 3"], bool]:
+        """Return the force on each foot, N, and whether a part that is kept clear has come down."""
+        force, hit, one = np.zeros((2, 3)), False, np.zeros(6)
+        for k, contact in enumerate(state.contact):
+            hit |= not self.kept_clear.isdisjoint(contact.geom)
+            bodies = self.model.geom_bodyid[contact.geom]  # the ground's is 0
+            if bodies.max() in self.feet:
+                mujoco.mj_contactForce(self.model, state, k, one)  # on the second geom
+                sign = 1.0 if bodies[1] else -1.0
+                foot = self.feet.index(bodies.max())
+                force[foot] += sign * contact.frame.reshape(3, 3).T @ one[:3]
+        return force, hit
+
+
+class _Judge:
+    """Says how a trial ends, by the rules of the training episodes (episode.ending)."""
+
+    def __init__(self, body: StandIn, state: mujoco.MjData) -> None:
+        self._body, self._c = body, body.config
+        self._support = state.qpos[2] - body.config.reward.base_height_target
+
+    def ending(self, state: mujoco.MjData) -> str | None:
+        """Return the first reason to end, or None."""
+        c, episode, body = self._c, self._c.episode, self._body
+        if any(warning.number for warning in state.warning):
+            return "unstable"
+        force, hit = body.feet_on_ground(state)
+        foot_z = state.xpos[body.feet, 2]
+        on_ground = np.linalg.norm(force, axis=1) > c.reward.contact_force
+        bearing = force[:, 2] > c.reward.support_force
+        if on_ground.any() and bearing.any():
+            self._support = float(foot_z[bearing].mean())
+        x, z = state.qpos[0], state.qpos[2]
+        upright = state.xmat[body.robot.pelvis].reshape(3, 3)[2, 2]
+        reasons = {
+            "tilted": upright < math.cos(episode.max_tilt),
+            "low": z - self._support < episode.min_height,
+            "hit": hit,
+            "dropped": foot_z.min() < self._support - episode.below_edge,
+            "finished": x > body.lane.end,
+        }
+        return next((name for name, is_so in reasons.items() if is_so), None)
+
+
+def run(body: StandIn, policy: Policy, start: Start, seconds: float, latency: int = 1) -> Trial:
+    """Let the policy walk once.
+
+    Args:
+        body: the model.
+        policy: as deploy.py loads it; it is reset.
+        start: pose and command.
+        seconds: at most.
+        latency: control steps from a frame's exposure until the policy has it.
+    """
+    c, period = body.config, body.config.physics.control_period
+    state = _placed(body, start)
+    judge, ending, status, path, speeds = _Judge(body, state), None, Status.OK, [], []
+    frames: list[tuple[int, float, np.ndarray]] = []  # due at a step, exposed at a time
+    policy.reset()
+    base = body.robot.pelvis
+    for t in range(round(seconds / period)):
+        path.append(state.qpos.copy())
+        if frames and frames[0][0] <= t:
+            _, stamp, image = frames.pop(0)
+            status |= policy.on_depth(image, stamp)
+        turned = state.xmat[base].reshape(3, 3)
+        target = policy.step(
+            state.qvel[3:6],
+            -turned[2],
+            steered(c.command, start.speed, state.qpos),
+            state.qpos[7:][body.driven],
+            state.qvel[6:][body.driven],
+            t * period,
+        )
+        status |= policy.status
+        if not policy.blind and _is_due(t + latency, c):
+            frames.append((t + latency, t * period, body.image(state)))
+        state.ctrl[body.driven] = target
+        for _ in range(c.physics.substeps):
+            mujoco.mj_step(body.model, state)
+        mujoco.mj_forward(body.model, state)  # poses and forces of this moment, not of the last
+        speeds.append(float(turned[:, 0] @ state.qvel[:3]))
+        ending = judge.ending(state)
+        if ending:
+            break
+    return Trial(
+        ending=ending or "timeout",
+        seconds=len(path) * period,
+        progress=float(state.qpos[0] - start.base[0]),
+        speed=float(np.mean(speeds)),
+        status=status,
+        qpos=np.stack(path),
+    )
+
+
+def steered(
+    c: config.Command, speed: float, qpos: Float[np.ndarray, " Q"]
+) -> Float[np.ndarray, "3"]:
+    """Return the command of an operator who keeps the robot on the middle of its lane."""
+    w, x, y, z = qpos[3:7]
+    heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    wanted = np.clip(-c.lane_gain * qpos[1], -0.5, 0.5)  # rad
+    error = (wanted - heading + math.pi) % (2.0 * math.pi) - math.pi
+    turn = np.clip(c.heading_gain * error, -c.lane_yaw_rate, c.lane_yaw_rate)
+    return np.array([speed, 0.0, turn])
+
+
+def _placed(body: StandIn, start: Start) -> mujoco.MjData:
+    """Return the state at the start, the upper body at its default."""
+    state = mujoco.MjData(body.model)
+    joints = body.robot.nominal_pose.astype(float)
+    joints[body.driven] = start.q
+    state.qpos[:] = np.concatenate([start.base, joints])
+    state.ctrl[:] = body.robot.nominal_pose
+    mujoco.mj_forward(body.model, state)
+    return state
+
+
+def _is_due(step: int, c: Config) -> bool:
+    """Return whether a frame arrives at this control step: see depth.is_due."""
+    frames = c.camera.rate * c.physics.control_period
+    return step > 0 and math.floor(step * frames + 1e-9) > math.floor((step - 1) * frames + 1e-9)
+
+
+def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors through the pixels' middles: right, down, forward."""
+    rows, columns = camera.shape
+    down, right = (math.tan(math.radians(0.5 * angle)) for angle in camera.view)
+    at = lambda n, reach: reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+    y, x = np.meshgrid(at(rows, down), at(columns, right), indexing="ij")
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _spec(c: Config, lane: Lane, whole: robot.Robot) -> mujoco.MjSpec:
+    """Return robot and ground; rays meet the ground and the links that training renders."""
+    spec = robot.spec("all", c.physics, contact_planes=0, visual=True)
+    capsules = whole.capsules
+    in_view = {n for n, yes in zip(capsules.names, capsules.in_view, strict=True) if yes}
+    clear = {n for n, yes in zip(capsules.names, capsules.kept_clear, strict=True) if yes}
+    for geom in spec.geoms:
+        touches = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE
+        geom.group = SEEN if geom.name in in_view else UNSEEN
+        geom.contype = int(touches or geom.name in clear)
+        geom.friction = [robot.FRICTION, 0.005, 0.0001]
+    around = math.ceil(MARGIN / lane.cell)
+    heights = np.pad(lane.heights, around, mode="edge")
+    origin = lane.origin - around * lane.cell
+    found = scene.boxes(heights, max(heights.shape), MOST_BOXES)
+    if found is None:
+        raise ConfigError(f"this ground needs more than {MOST_BOXES} boxes")
+    bottom = float(lane.heights.min()) - 0.1  # m
+    for first, size, height in zip(found.first, found.size, found.height, strict=True):
+        half = 0.5 * (height - bottom)
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[*(origin + (first + 0.5 * size) * lane.cell), height - half],
+            size=[*(0.5 * size * lane.cell), half],
+            friction=[robot.FRICTION, 0.005, 0.0001],
+            contype=0,
+            conaffinity=1,
+            group=GROUND,
+        )
+    return spec

@@ -1,0 +1,266 @@
+import ast
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from policies import ROBOT, SMALL, J, contents, metres, policy, recorded
+
+from cref_jax import config, deploy, vectors
+from cref_jax.deploy import Status
+
+PERIOD = 0.02
+
+
+def runtime(variant="full", net=SMALL, **guards):
+    manifest, arrays = contents(policy(variant, net))
+    manifest["guards"].update(guards)
+    return deploy.Policy(manifest, arrays)
+
+
+@pytest.fixture
+def robot():
+    return runtime()
+
+
+def still(**changes):
+    """Return the inputs of a robot that stands at its nominal pose."""
+    inputs = {
+        "angular_velocity": np.zeros(3),
+        "gravity": np.array([0.0, 0.0, -1.0]),
+        "command": np.array([0.5, 0.0, 0.0]),
+        "q": ROBOT.nominal_pose,
+        "qd": np.zeros(J),
+        "now": 0.0,
+    }
+    return list((inputs | changes).values())
+
+
+def frame(value=1.5):
+    return np.full((48, 64), value, np.float32)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", deploy.VARIANTS)
+def test_it_says_what_the_network_says_over_1000_steps_with_resets(variant):
+    trained = policy(variant, config.Network())
+    steps = recorded(1000, sees=variant != "blind")
+    ours, worst = runtime(variant, config.Network(), rate_rad=[1e6] * J, beyond_rad=[1e6] * J), {}
+    expected = vectors.reference(
+        trained.config.network, trained.train, ROBOT, trained.config.robot, steps
+    )
+    expected = {name: np.asarray(x) for name, x in expected.items()}
+    assert len(expected) == {"blind": 11, "no_cross_attention": 14}.get(variant, 15)
+    for t in range(1000):
+        if steps.reset[t]:
+            ours.reset()
+        if steps.fresh[t]:
+            assert ours.on_depth(metres(steps.image[t]), t * PERIOD) == Status.OK
+        target = ours.step(*(x[t] for x in steps[:5]), t * PERIOD)
+        assert not ours.status & (deploy.FAULTS | Status.RATE_LIMITED | Status.RANGE_LIMITED)
+        said = ours.tensors() | {"target": target}
+        for name, tensor in expected.items():
+            error = np.abs(said[name] - tensor[t]).max() / np.abs(tensor).max()
+            worst[name] = max(worst.get(name, 0.0), float(error))
+    assert steps.reset.sum() > 10
+    assert max(worst.values()) < 1e-5, worst
+
+
+def test_holes_read_as_the_far_plane_and_millimetres_as_metres(robot):
+    def seen(depth):
+        robot.reset()
+        robot.on_depth(depth, 0.0)
+        robot.step(*still())
+        return robot.tensors()["tokens"]
+
+    far, depth = frame(), frame()
+    far[:10] = 3.0
+    depth[:4], depth[4:8], depth[8:9], depth[9:10] = 0.0, np.nan, np.inf, 7.0
+    np.testing.assert_array_equal(seen(depth), seen(far))
+    assert np.abs(seen(frame()) - seen(far)).max() > 1e-3
+    millimetres = np.where(np.isfinite(depth), 1000 * depth, 0).astype(np.uint16)
+    np.testing.assert_array_equal(seen(millimetres), seen(far))
+
+
+@pytest.mark.parametrize(
+    ("depth", "stamp", "said"),
+    [
+        (np.zeros((64, 48), np.float32), 0.0, Status.BAD_DEPTH),
+        (np.ones((48, 64), np.int64), 0.0, Status.BAD_DEPTH),
+        (None, 0.0, Status.BAD_DEPTH),
+        ("depth", 0.0, Status.BAD_DEPTH),
+        (frame(), float("nan"), Status.BAD_DEPTH),
+        (frame(), None, Status.BAD_DEPTH),
+        (frame(0.0), 0.0, Status.INVALID_DEPTH),
+        (frame(np.nan), 0.0, Status.INVALID_DEPTH),
+    ],
+)
+def test_a_frame_that_cannot_be_used_is_not_used(robot, depth, stamp, said):
+    robot.on_depth(frame(), 0.0)
+    robot.step(*still())
+    before = robot.tensors()["tokens"]
+    assert robot.on_depth(depth, stamp) == said
+    robot.step(*still(now=PERIOD))
+    np.testing.assert_array_equal(robot.tensors()["tokens"], before)
+
+
+def test_it_says_when_there_is_no_frame_and_when_it_is_old(robot):
+    robot.step(*still())
+    assert robot.status == Status.NO_DEPTH
+    robot.on_depth(frame(), 0.01)
+    robot.step(*still(now=0.02))
+    assert robot.status == Status.OK
+    robot.step(*still(now=0.04))
+    robot.step(*still(now=0.12))
+    assert robot.status == Status.STALE_DEPTH | Status.LATE  # 110 ms; 80 ms since the step before
+    robot.step(*still(now=0.11))
+    assert robot.status == Status.LATE  # 100 ms is not too old; the clock went back
+
+
+BAD = [
+    {"q": np.zeros(J - 1)},
+    {"q": np.full(J, np.nan)},
+    {"q": np.rad2deg(ROBOT.nominal_pose)},
+    {"q": None},
+    {"q": ["a"] * J},
+    {"qd": np.full(J, np.inf)},
+    {"gravity": np.array([0.0, 0.0, -9.81])},
+    {"gravity": np.zeros(3)},
+    {"angular_velocity": np.array([1e39, 0.0, 0.0])},
+    {"command": np.zeros(3, complex)},
+    {"command": np.zeros((1, 3))},
+    {"now": float("nan")},
+    {"now": None},
+]
+
+
+@pytest.mark.parametrize("bad", BAD, ids=lambda bad: str(bad)[:30])
+def test_a_bad_input_holds_the_last_target_and_then_lets_the_robot_down(bad):
+    robot = runtime(hold_steps=2)
+    robot.on_depth(frame(), 0.0)
+    good = robot.step(*still())
+    memory = robot.tensors()["gru"]
+    for _ in range(2):
+        np.testing.assert_array_equal(robot.step(*still(**bad)), good)
+        assert robot.status & ~Status.LATE == Status.BAD_INPUT | Status.HOLDING
+    np.testing.assert_array_equal(robot.tensors()["gru"], memory)
+    np.testing.assert_allclose(robot.step(*still(**bad)), ROBOT.nominal_pose)
+    assert robot.status & ~Status.LATE == Status.BAD_INPUT | Status.DAMPING
+    moved = ROBOT.nominal_pose + np.float32(0.01)
+    np.testing.assert_array_equal(robot.step(*still(q=moved)), moved)  # no torque but damping's
+    assert robot.status & Status.DAMPING
+    robot.reset()
+    robot.step(*still())
+    assert robot.status == Status.NO_DEPTH
+
+
+def test_damping_follows_the_joints_as_long_as_they_are_measured():
+    robot = runtime(hold_steps=0)
+    robot.step(*still())
+    moved = ROBOT.nominal_pose + np.float32(0.02)
+    np.testing.assert_array_equal(robot.step(*still(q=moved, gravity=None)), moved)
+    np.testing.assert_array_equal(robot.step(*still(q=None)), moved)
+
+
+def test_nothing_raises_where_numpy_is_told_to_raise(robot):
+    class Broken:
+        def __array__(self, *_, **__):
+            raise RuntimeError
+
+    with np.errstate(all="raise"):
+        robot.on_depth(frame().astype(np.float64) * 1e300, 0.0)
+        robot.on_depth(Broken(), 0.0)
+        robot.step(*still(qd=np.full(J, 1e6)))
+        robot.step(*still(q=Broken()))
+        robot.step(*still(angular_velocity=np.full(3, 1e300)))
+        assert robot.status & Status.BAD_INPUT
+
+
+def test_one_bad_input_is_bridged():
+    robot = runtime(hold_steps=2)
+    robot.step(*still())
+    robot.step(*still(q=None))
+    assert robot.status & Status.HOLDING
+    robot.step(*still(now=PERIOD))
+    assert not robot.status & (Status.HOLDING | Status.DAMPING)
+
+
+def test_without_a_last_target_a_bad_input_lets_the_robot_down(robot):
+    np.testing.assert_array_equal(robot.step(*still(qd=None)), ROBOT.nominal_pose)
+    assert robot.status & Status.DAMPING
+
+
+def test_the_memory_of_an_answer_that_is_not_finite_is_never_used():
+    manifest, arrays = contents(policy("full"))
+    arrays = {k: np.array(x) for k, x in arrays.items()}
+    arrays["action_head/layer_1/bias"][:] = arrays["action_head/layer_2/kernel"][:] = 3e38
+    robot = deploy.Policy(manifest, arrays)
+    assert np.isfinite(robot.step(*still())).all()
+    assert robot.status & Status.BAD_ACTION
+
+
+def test_commands_stay_within_what_was_trained(robot):
+    inside = robot.step(*still(command=np.array([1.0, 0.3, 0.0])))
+    robot.reset()
+    outside = robot.step(*still(command=np.array([5.0, 9.0, 0.0])))
+    assert robot.status & Status.COMMAND_LIMITED
+    np.testing.assert_array_equal(inside, outside)
+
+
+def test_targets_move_no_further_than_the_limits():
+    wide = runtime(rate_rad=[1e6] * J, beyond_rad=[1e6] * J)
+    narrow = runtime(rate_rad=[1e-4] * J, beyond_rad=[1e6] * J)
+    inputs = [still(), still(qd=np.full(J, 5.0), now=PERIOD)]
+    first, second = (wide.step(*x) for x in inputs)
+    np.testing.assert_array_equal(narrow.step(*inputs[0]), first)
+    limited = narrow.step(*inputs[1])
+    assert narrow.status & Status.RATE_LIMITED
+    np.testing.assert_allclose(limited - first, np.clip(second - first, -1e-4, 1e-4), atol=1e-7)
+    inside = runtime(beyond_rad=[0.0] * J, rate_rad=[1e6] * J)
+    for t in range(50):
+        target = inside.step(*still(qd=np.full(J, -30.0 + t), now=t * PERIOD))
+        assert (target >= ROBOT.range_low).all() and (target <= ROBOT.range_high).all()
+
+
+def test_the_guards_on_targets_take_nothing_that_the_motors_can_do():
+    # beyond effort / kp from any pose in range the torque is at its limit already
+    guards = contents(policy("full"))[0]["guards"]
+    reach = ROBOT.effort / ROBOT.kp
+    np.testing.assert_allclose(guards["beyond_rad"], reach, rtol=1e-6)
+    np.testing.assert_allclose(guards["rate_rad"], 2 * reach, rtol=1e-6)
+
+
+def test_frames_from_another_thread_come_whole(robot):
+    robot.on_depth(frame(1.0), 0.0)
+    robot.step(*still())
+    one = robot.tensors()["tokens"]
+    robot.on_depth(frame(2.0), 0.0)
+    robot.step(*still())
+    two = robot.tensors()["tokens"]
+    over = threading.Event()
+
+    def look():
+        while not over.is_set():
+            robot.on_depth(frame(1.0), 0.0)
+            robot.on_depth(frame(2.0), 0.0)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        for t in range(300):
+            robot.step(*still(now=t * PERIOD))
+            tokens = robot.tensors()["tokens"]
+            assert (tokens == one).all() or (tokens == two).all()
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_the_returned_target_is_the_callers(robot):
+    first = robot.step(*still())
+    first[:] = 99.0
+    assert np.abs(robot.step(*still(q=None))).max() < 10.0
+
+
+def test_the_file_is_python_3_8():
+    ast.parse(Path(deploy.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))

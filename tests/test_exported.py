@@ -1,0 +1,121 @@
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from policies import ROBOT, SMALL, J, policy, recorded
+
+from cref_jax import config, deploy, exported, robot, vectors
+from cref_jax.config import ConfigError
+
+
+@pytest.fixture
+def small_world(world):
+    c = dataclasses.replace(world.config, network=SMALL)
+    return world.replace(config=c)
+
+
+def trained(world):
+    return policy("full")._replace(config=world.config)
+
+
+@pytest.fixture
+def directory(small_world, tmp_path):
+    exported.write(trained(small_world), small_world, tmp_path / "policy")
+    return tmp_path / "policy"
+
+
+@pytest.mark.slow
+def test_a_directory_tests_itself_on_a_machine_with_nothing_but_numpy(directory):
+    assert sorted(path.name for path in directory.iterdir()) == [
+        "cref_runtime.py", "manifest.json", "testvectors.npz", "weights.npz",
+    ]  # fmt: skip
+    blocked = "import sys, runpy; sys.modules['jax'] = sys.modules['mujoco'] = None; "
+    for target in (directory, directory.with_name("policy.zip")):
+        arguments = f"sys.argv = ['x', '--selftest', {str(target)!r}]; "
+        run = f"runpy.run_path({str(directory / 'cref_runtime.py')!r}, run_name='__main__')"
+        done = subprocess.run(
+            [sys.executable, "-c", blocked + arguments + run], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert "p99" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_runtime_that_says_something_else_fails_its_test(directory, monkeypatch):
+    monkeypatch.setattr(deploy._Fusion, "__call__", lambda self, x: np.copyto(self.out, x) or x)
+    with pytest.raises(deploy.PolicyFormatError, match="differs from training"):
+        deploy.self_test(directory)
+
+
+@pytest.mark.slow
+def test_the_vectors_hold_a_reset_a_frame_with_holes_and_the_true_rate(small_world):
+    found = vectors.test_vectors(small_world, trained(small_world).train)
+    assert found["reset"].sum() == 2 and found["reset"][vectors.STEPS // 2]
+    assert set(np.diff(found["frame_step"][:10])) == {2, 3}
+    holed = found["frames"][vectors.HOLED]
+    assert np.isnan(holed).any() and (holed == 0.0).any()
+    assert np.abs(found["expect/attention"]).max() > 0.0
+    np.testing.assert_allclose(found["now"][found["frame_step"]] - found["stamps"], 0.02)
+
+
+@pytest.mark.slow
+def test_a_policy_comes_back_as_it_went(directory, small_world):
+    was, found = trained(small_world), exported.read(directory, small_world)
+    assert found.config == was.config and found.iteration == was.iteration
+    steps = recorded(20)
+    say = lambda train: vectors.reference(SMALL, train, ROBOT, was.config.robot, steps)
+    np.testing.assert_array_equal(say(found.train)["action"], say(was.train)["action"])
+
+
+def test_the_manifest_says_what_the_engineer_needs():
+    manifest = exported.manifest(policy("full"), ROBOT)
+    assert [joint["name"] for joint in manifest["joints"]] == list(ROBOT.joint_names)
+    whole = robot.load(config.Robot(actuated="all"))
+    held = {joint["name"] for joint in manifest["held_joints"]}
+    assert held == set(whole.joint_names) - set(ROBOT.joint_names)
+    assert sum(term["size"] for term in manifest["observation"]["terms"]) == 9 + 3 * J
+    assert len(manifest["observation"]["mean"]) == 9 + 3 * J
+    assert manifest["depth"]["mount"]["link"] in robot.XML.read_text()
+    assert manifest["rates"] == {"control_hz": 50.0, "depth_hz": 20.0, "frame_age_s": 0.02}
+    json.dumps(manifest, allow_nan=False)
+
+
+def test_numbers_survive_the_text_to_the_last_bit():
+    manifest = json.loads(json.dumps(exported.manifest(policy("full"), ROBOT)))
+    mean = np.asarray(policy("full").train.statistics.obs.mean)
+    np.testing.assert_array_equal(np.array(manifest["observation"]["mean"], np.float32), mean)
+    kp = [joint["kp"] for joint in manifest["joints"]]
+    np.testing.assert_array_equal(np.array(kp, np.float32), ROBOT.kp)
+
+
+def test_a_run_and_a_policy_exclude_each_other(tmp_path):
+    with pytest.raises(ConfigError, match="not both"):
+        exported.chosen(tmp_path, tmp_path)
+    assert exported.chosen(None, tmp_path) == tmp_path
+
+
+def test_without_a_run_the_bundled_policy_is_taken(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert exported.chosen(None, None) == exported.bundled()
+    assert not exported.is_run(exported.bundled())
+
+
+def test_what_is_no_policy_is_one_line(tmp_path):
+    (tmp_path / "manifest.json").write_text("{}")
+    with pytest.raises(ConfigError, match="has no 'format'"):
+        exported.read_config(tmp_path)
+
+
+def test_the_bundled_policy_is_whole_and_small_enough():
+    deploy.self_test(exported.bundled(), rounds=1)
+    files = list(exported.bundled().iterdir())
+    assert sum(file.stat().st_size for file in files) < 10e6
+
+
+def test_the_bundled_runtime_is_this_versions():
+    theirs = exported.bundled() / "cref_runtime.py"
+    assert theirs.read_bytes() == Path(deploy.__file__).read_bytes()  # export --refresh mends it

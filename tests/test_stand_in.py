@@ -1,0 +1,161 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from policies import ROBOT, contents, policy
+from sample import put
+
+from cref_jax import deploy, depth, env, episode, evaluation, scene, sim2sim, stand_in
+from cref_jax.config import Config
+from cref_jax.physics import Physics
+from cref_jax.stand_in import Lane, StandIn, Start
+
+C = evaluation.evaluation_config(Config())
+FLAT = Lane(np.zeros((600, 200), np.float32), np.array([0.0, -2.0], np.float32), 0.02, 11.0)
+STANDING = Start(
+    np.array([0.7, 0.0, ROBOT.standing_height, 1.0, 0.0, 0.0, 0.0], np.float32),
+    ROBOT.nominal_pose,
+    0.5,
+)
+
+
+def on_lane(lane=FLAT):
+    return StandIn(C, lane, ROBOT.joint_names)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return on_lane()
+
+
+def runtime(variant="full"):
+    return deploy.Policy(*contents(policy(variant)))
+
+
+def placed(body, **changes):
+    """Return the state with the base's position and rotation changed."""
+    base = np.array(STANDING.base)
+    for name, value in changes.items():
+        base[{"x": 0, "y": 1, "z": 2, "rotation": slice(3, 7)}[name]] = value
+    return stand_in._placed(body, STANDING._replace(base=base))
+
+
+def gap_world():
+    c = dataclasses.replace(C, terrain=dataclasses.replace(C.terrain, name="gap"))
+    return evaluation.crossing_world(c, Physics(c.robot, c.physics, "mujoco"), "gap", 0.5)
+
+
+def test_it_sees_what_the_robot_sees_in_training():
+    world = gap_world()
+    body = on_lane(sim2sim.lane_of(world))
+    heights = scene.window(world.lanes.tile(0, 0))[0]
+    edge = 0.02 * int(np.argmin(heights[:, 100] > -0.5))  # m, where the first gap begins
+    turned = np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)], np.float32)
+    for x in (edge - 0.8, edge - 0.3):
+        state = placed(body, x=x, rotation=turned)
+        ours = body.image(state)
+        at_start = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
+        robot = put(at_start, x=x, y=0.0, z=ROBOT.standing_height, rotation=jnp.array(turned))
+        robot = robot.replace(
+            body=robot.body._replace(qpos=robot.body.qpos.at[7:].set(ROBOT.nominal_pose))
+        )
+        seen = jax.jit(env.depth_image)(world, robot)
+        metres = (np.asarray(seen) + 0.5) * C.camera.d_max
+        held = np.minimum(np.where(np.isfinite(ours), ours, np.inf), C.camera.d_max)
+        assert np.mean(np.abs(metres - held) < 0.01) > 0.99
+        assert np.ptp(held) > 0.5
+
+
+def test_the_operator_steers_as_in_training():
+    world = gap_world()
+    state = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
+    state = state.replace(command_left=jnp.int32(1000))
+    command = jax.jit(episode.commanded)
+    for y, angle in [(0.0, 0.0), (0.8, 0.3), (-3.0, 0.5), (0.2, 3.0), (0.0, -3.1)]:
+        rotation = jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+        there = put(state, y=y, rotation=rotation)
+        expected = command(world, there, jax.random.key(0)).command
+        found = stand_in.steered(C.command, float(state.command[0]), np.asarray(there.body.qpos))
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_frames_come_when_they_come_in_training():
+    period = C.physics.control_period
+    for step in range(1, 101):
+        assert stand_in._is_due(step, C) == depth.is_due(step, C.camera, period)
+
+
+def test_the_ground_bears_the_robots_weight(body):
+    state = placed(body)
+    for _ in range(60):  # 0.3 s under PD
+        mujoco.mj_step(body.model, state)
+    force, hit = body.feet_on_ground(state)
+    weight = ROBOT.mass * 9.81
+    assert force[:, 2].sum() == pytest.approx(weight, rel=0.3)
+    assert not hit
+
+
+@pytest.mark.parametrize(
+    ("changes", "ending"),
+    [
+        ({}, None),
+        ({"rotation": [np.cos(0.6), 0.0, np.sin(0.6), 0.0], "z": 1.5}, "tilted"),
+        ({"z": 0.2}, "low"),
+        ({"x": 11.5}, "finished"),
+        ({"z": np.nan}, "unstable"),
+    ],
+)
+def test_a_trial_ends_as_an_episode_does(body, changes, ending):
+    judge = stand_in._Judge(body, placed(body))
+    state = placed(body, **changes)
+    if ending == "unstable":
+        mujoco.mj_step(body.model, state)
+    assert judge.ending(state) == ending
+
+
+def test_a_foot_far_below_the_last_support_has_dropped():
+    heights = np.zeros((600, 200), np.float32)
+    heights[60:] = -1.0
+    body = on_lane(Lane(heights, FLAT.origin, FLAT.cell, FLAT.end))
+    judge = stand_in._Judge(body, placed(body))
+    judge._support += 0.6
+    assert judge.ending(placed(body, x=5.0)) in ("low", "dropped")
+
+
+def test_upper_body_on_the_ground_is_a_hit(body):
+    lying = [np.cos(np.pi / 4), 0.0, np.sin(np.pi / 4), 0.0]  # face down
+    state = placed(body, rotation=lying, z=0.05)
+    assert body.feet_on_ground(state)[1]
+
+
+def test_a_trial_is_the_same_twice_and_says_how_it_went(body):
+    first, second = (stand_in.run(body, runtime(), STANDING, 0.5) for _ in range(2))
+    np.testing.assert_array_equal(first.qpos, second.qpos)
+    assert first.ending in ("timeout", "low", "tilted", "hit")
+    assert first.seconds == pytest.approx(len(first.qpos) * 0.02)
+    assert not first.status & (deploy.FAULTS | deploy.Status.STALE_DEPTH | deploy.Status.BAD_DEPTH)
+    assert first.status & deploy.Status.NO_DEPTH  # the first frame comes after 60 ms
+
+
+def test_frames_that_come_too_late_are_noticed(body):
+    late = stand_in.run(body, runtime(), STANDING, 0.4, latency=8)
+    assert late.status & deploy.Status.STALE_DEPTH
+
+
+def test_a_blind_policy_walks_without_frames(body):
+    trial = stand_in.run(body, runtime("blind"), STANDING, 0.2)
+    assert trial.status & ~deploy.Status.RANGE_LIMITED & ~deploy.Status.RATE_LIMITED == 0
+
+
+def test_nothing_of_jax_is_in_the_loop(body, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("JAX was called")
+
+    for name in ("jit", "device_put"):
+        monkeypatch.setattr(jax, name, refuse)
+    monkeypatch.setattr(jnp, "asarray", refuse)
+    monkeypatch.setattr(jax._src.core.Primitive, "bind", refuse)
+    stand_in.run(body, runtime(), STANDING, 0.1)
