@@ -17,6 +17,7 @@ from cref_jax.world import World, make_world
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # of an episode on flat ground; assumed
 CROSSING_SECONDS = 40.0  # of a trial on a lane, Sec. III-A
+FALLS = ("tilted", "low", "hit", "dropped", "unstable")  # of Ending
 WALK_SEED = 1_000_003  # apart from the seeds of training
 
 
@@ -115,13 +116,12 @@ def cross(
     done = ending.finished & ~ending.terminated
     lived = trace.alive.sum(axis=0)
     seconds = lived * c.physics.control_period
-    failures = {**ending._asdict(), "timeout": ~done & ~ending.terminated}
     return Crossing(
         kind=kind,
         size_m=size,
         trials=trials,
         successes=int(done.sum()),
-        by_cause={n: int(f.sum()) for n, f in failures.items() if n != "finished"},
+        by_cause=_by_cause(ending, (*FALLS, "timeout")),
         seconds=float(seconds[done].mean()) if done.any() else float("nan"),
         speed=float((np.sum(trace.forward_speed * trace.alive, axis=0) / lived).mean()),
     )
@@ -173,6 +173,15 @@ def _episodes(
     return Ending(*(flag.any(axis=0) for flag in endings)), trace
 
 
+def _by_cause(ending: Ending, causes: tuple[str, ...]) -> dict[str, int]:
+    """Return how many robots failed for each cause; one that has several counts for the first."""
+    counts, left = {}, ~np.asarray(ending.finished & ~ending.terminated)
+    for cause in causes:
+        of_this = left & np.asarray(getattr(ending, cause))
+        counts[cause], left = int(of_this.sum()), left & ~of_this
+    return counts
+
+
 def _judged(ending: Ending, trace: _Step, c: Config) -> Walk:
     alive, lived = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
     of_episode = lambda x: np.sum(x * alive, axis=0) / lived
@@ -180,13 +189,10 @@ def _judged(ending: Ending, trace: _Step, c: Config) -> Walk:
     airborne = np.sum(trace.airborne * both, axis=(0, 1)) / np.maximum(alive.sum(), 1)
     touchdowns = (trace.airborne[:-1] & ~trace.airborne[1:] & both[1:]).sum()
     seconds = 2 * alive.sum() * c.physics.control_period  # of foot and robot
-    failed = {"tilted", "low", "hit", "dropped", "unstable"}
     return Walk(
         episodes=alive.shape[1],
         fell=int(ending.terminated.sum()),
-        by_cause={
-            name: int(flag.sum()) for name, flag in ending._asdict().items() if name in failed
-        },
+        by_cause=_by_cause(ending, FALLS),
         speed_error=float(np.abs(of_episode(trace.forward_error)).mean()),
         tracking_error=float(of_episode(trace.tracking_error).mean()),
         airborne=(float(airborne[0]), float(airborne[1])),

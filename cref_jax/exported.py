@@ -25,7 +25,7 @@ from cref_jax.config import Config, ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
 
-BUNDLED = "flat"  # the policy that comes with the package
+BUNDLED = "gap"  # the policy that comes with the package
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
 STALE = 0.1  # s, two frames of the camera
 MOST_INVALID = 0.5  # of a frame's pixels; assumed: beyond, the last frame tells more

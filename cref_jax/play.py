@@ -3,32 +3,25 @@
 Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
 """
 
-import contextlib
 import dataclasses
 import functools
-import itertools
 import math
 import os
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from ctypes.util import find_library
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
 
-# Here, because mujoco reads it at its first import, and fails there if the library is missing.
-if sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
-    has = [name for name, file in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(file)]
-    os.environ.setdefault("MUJOCO_GL", has[0] if has else "off")
+from cref_jax import film  # before mujoco, whose OpenGL it chooses
 
-import imageio_ffmpeg
+# isort: split
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from PIL import Image
 from rich.progress import track
 
 from cref_jax import (
@@ -155,11 +148,11 @@ def play(options: Options) -> None:
         recording = record(world, train, options)
         if options.stills:
             moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
-            _write_stills(out, _film(canvas, recording._replace(minds=None), moments, c))
+            film.write_stills(out, _film(canvas, recording._replace(minds=None), moments, c))
         else:
             stride = max(1, round(1.0 / (FRAME_RATE * period)))
             moments = np.arange(0, len(recording.qpos), stride)
-            _write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
+            film.write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
     print(f"wrote {out}")
     print(summary(recording, options.command, period))
 
@@ -325,38 +318,6 @@ def _film(
 def _tracked(items: Iterable[T], title: str) -> Iterable[T]:
     """Yield the items, with a progress bar on a terminal."""
     return track(items, title, transient=True, disable=not sys.stdout.isatty())
-
-
-def _write_stills(out: Path, frames: Iterable[scene.Frame]) -> None:
-    """Write pictures side by side as one."""
-    try:
-        Image.fromarray(np.concatenate(list(frames), axis=1)).save(out)
-    except OSError as error:
-        raise ConfigError(f"cannot write {out}: {error.strerror or error}") from error
-
-
-def _write_video(out: Path, frames: Iterable[scene.Frame], rate: float) -> None:
-    """Write pictures as a film of `rate` pictures a second."""
-    part = out.with_suffix(".part.mp4")  # a film that was cut off does not replace a whole one
-    frames = iter(frames)
-    first = next(frames)
-    size = f"{first.shape[1]}x{first.shape[0]}"
-    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {rate:g} -i -"
-    target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags faststart"
-    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
-    command = [*program, *source.split(), *target.split(), str(part)]
-    try:
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
-            assert ffmpeg.stdin and ffmpeg.stderr
-            with contextlib.suppress(BrokenPipeError):  # it says why, and exits
-                for frame in itertools.chain([first], frames):
-                    ffmpeg.stdin.write(frame.tobytes())
-            said = ffmpeg.communicate()[1].decode(errors="replace").strip()
-        if ffmpeg.returncode:
-            raise ConfigError(f"cannot write {out}: {said.splitlines()[-1] if said else 'ffmpeg'}")
-        part.replace(out)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

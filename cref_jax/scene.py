@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from cref_jax import config, robot
 from cref_jax.config import ConfigError
+from cref_jax.film import Frame
 from cref_jax.terrain import Terrain
-
-Frame = UInt8[np.ndarray, "height width 3"]
 
 GROUND = 0  # geom group of the lane and of the plain; the robot's shapes are in 2 and 3
 MOST_BOXES = 150  # beyond, a height field; stairs take some 40, a slope 200 and more

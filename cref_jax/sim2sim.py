@@ -11,6 +11,10 @@ from cref_jax import deploy  # before numpy, whose number of threads it sets
 
 # isort: split
 
+from cref_jax import film  # before mujoco, whose OpenGL it chooses
+
+# isort: split
+
 import numpy as np
 import tyro
 from rich.progress import track
@@ -20,6 +24,9 @@ from cref_jax.config import ConfigError
 from cref_jax.evaluation import CROSSING_SECONDS, Crossing
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.world import World
+
+FRAME_RATE = 25.0  # 1/s, of a film
+SIZE = (960, 540)  # pixels of it
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,8 @@ class Options:
     """evaluate the same trials in the training simulation, too"""
     out: Path | None = None
     """file for the results, .json"""
+    film: Path | None = None
+    """file for a film of the first trial, .mp4"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -53,6 +62,8 @@ def main(arguments: list[str] | None = None) -> None:
         cli.prepare()
         if options.trials < 1:
             raise ConfigError(f"--trials must be at least 1, not {options.trials}")
+        if options.film and options.film.suffix != ".mp4":
+            raise ConfigError(f"--film must end in .mp4: {options.film}")
         path = options.policy or exported.bundled()
         policy = exported.read(path)
         physics = runs.world_of(policy.config, "mujoco").physics
@@ -73,6 +84,9 @@ def main(arguments: list[str] | None = None) -> None:
             )  # fmt: skip
             print(f"training simulation, JAX:   {theirs.line()}")
             record["training"] = theirs._asdict()
+        if options.film:
+            _film(options.film, world, trials[0])
+            print(f"wrote {options.film}")
         if options.out:
             options.out.write_text(json.dumps(record, indent=2) + "\n")
 
@@ -88,8 +102,11 @@ def walked(world: World, path: Path, options: Options) -> list[Trial]:
         return stand_in.run(body, deploy.Policy(*contents), start, CROSSING_SECONDS, latency)
 
     begun = starts(world, options.seed, options.trials)
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
+    try:
         return list(track(pool.map(one, begun), "walking", total=len(begun), transient=True))
+    finally:  # Ctrl-C does not wait for those that have not begun
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def lane_of(world: World) -> Lane:
@@ -119,6 +136,17 @@ def crossing(trials: list[Trial], options: Options) -> Crossing:
         seconds=float(np.mean(seconds)) if seconds else float("nan"),
         speed=float(np.mean([trial.speed for trial in trials])),
     )
+
+
+def _film(out: Path, world: World, trial: Trial) -> None:
+    """Write what the robot did as a film."""
+    c, period = world.config, world.config.physics.control_period
+    stride = max(1, round(1.0 / (FRAME_RATE * period)))
+    points = scene.camera_path(trial.qpos, period)
+    moments = range(0, len(trial.qpos), stride)
+    with scene.Canvas(scene.build("all", c.physics, world.lanes.tile(0, 0)), *SIZE) as canvas:
+        frames = (canvas.draw(trial.qpos[t], points[t]) for t in track(moments, "drawing"))
+        film.write_video(out, frames, 1.0 / (stride * period))
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 # Before the first import of jax or mujoco: both read these once.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 

@@ -32,6 +32,14 @@ def test_two_of_three_robots_that_fall_are_counted_by_cause():
     assert walk.by_cause == {"tilted": 1, "low": 1, "hit": 0, "dropped": 0, "unstable": 0}
 
 
+def test_a_robot_with_two_causes_counts_once():
+    end = ending(
+        3, tilted=[True, False, False], low=[True, True, False], finished=[False, False, True]
+    )
+    causes = evaluation._by_cause(end, ("tilted", "low", "timeout"))
+    assert causes == {"tilted": 1, "low": 1, "timeout": 0}
+
+
 def test_what_comes_after_a_fall_does_not_count():
     # robot 0 lives 2 of 4 steps with an error of 0.2 and would have 9 afterwards; robot 1 has 0.4
     alive = np.array([[1, 1], [1, 1], [0, 1], [0, 1]], bool)

@@ -13,7 +13,7 @@ NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
     {"config", "geometry", "deploy", "leaves", "layers"},
-    {"terrain", "shapes", "robot", "host_call"},
+    {"terrain", "shapes", "robot", "host_call", "film"},
     {"kinematics", "lanes", "host_physics"},
     {"physics", "depth", "foothold"},
     {"world", "observation", "reward"},

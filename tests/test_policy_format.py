@@ -9,10 +9,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from policies import ROBOT, J, contents, policy
 
 from cref_jax import deploy, exported
 from cref_jax.deploy import PolicyFormatError
+from policies import ROBOT, J, contents, policy
 
 MUTATIONS = 10_000
 
@@ -128,7 +128,7 @@ def archive(files) -> bytes:
 def test_damaged_weights_are_refused_even_where_the_digest_is_right(tmp_path, files):
     for case, data, message in bad_weights(files):
         put(tmp_path, weights(files, data))
-        with pytest.raises(PolicyFormatError, match=message):
+        with pytest.raises(PolicyFormatError, match=message or None):
             deploy.load(tmp_path)
             pytest.fail(case)
 

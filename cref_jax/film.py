@@ -1,0 +1,58 @@
+"""Pictures to files, and the OpenGL that draws them: import this before mujoco.
+
+mujoco reads MUJOCO_GL at its first import, and fails there if the library is missing.
+"""
+
+import contextlib
+import itertools
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from ctypes.util import find_library
+from pathlib import Path
+
+if sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
+    has = [name for name, file in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(file)]
+    os.environ.setdefault("MUJOCO_GL", has[0] if has else "off")
+
+import imageio_ffmpeg
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from cref_jax.config import ConfigError
+
+Frame = UInt8[np.ndarray, "height width 3"]
+
+
+def write_stills(out: Path, frames: Iterable[Frame]) -> None:
+    """Write pictures side by side as one."""
+    try:
+        Image.fromarray(np.concatenate(list(frames), axis=1)).save(out)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def write_video(out: Path, frames: Iterable[Frame], rate: float) -> None:
+    """Write pictures as a film of `rate` pictures a second."""
+    part = out.with_suffix(".part.mp4")  # a film that was cut off does not replace a whole one
+    frames = iter(frames)
+    first = next(frames)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    source = f"-f rawvideo -pix_fmt rgb24 -s {size} -r {rate:g} -i -"
+    target = "-c:v libx264 -crf 20 -pix_fmt yuv420p -movflags faststart"
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y"]
+    command = [*program, *source.split(), *target.split(), str(part)]
+    try:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+            assert ffmpeg.stdin and ffmpeg.stderr
+            with contextlib.suppress(BrokenPipeError):  # it says why, and exits
+                for frame in itertools.chain([first], frames):
+                    ffmpeg.stdin.write(frame.tobytes())
+            said = ffmpeg.communicate()[1].decode(errors="replace").strip()
+        if ffmpeg.returncode:
+            raise ConfigError(f"cannot write {out}: {said.splitlines()[-1] if said else 'ffmpeg'}")
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
