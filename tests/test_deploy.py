@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from policies import ROBOT, SMALL, J, contents, metres, policy, recorded
+from random_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import config, deploy, vectors
 from cref_jax.deploy import Status

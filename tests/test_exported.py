@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from policies import ROBOT, SMALL, J, policy, recorded
+from random_policy import ROBOT, SMALL, J, policy, recorded
 
 from cref_jax import config, deploy, exported, robot, vectors
 from cref_jax.config import ConfigError

@@ -9,10 +9,10 @@ import zipfile
 
 import numpy as np
 import pytest
+from random_policy import ROBOT, J, contents, policy
 
 from cref_jax import deploy, exported
 from cref_jax.deploy import PolicyFormatError
-from policies import ROBOT, J, contents, policy
 
 MUTATIONS = 10_000
 

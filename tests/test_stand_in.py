@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from policies import ROBOT, contents, policy
+from random_policy import ROBOT, contents, policy
 from sample import put
 
 from cref_jax import deploy, depth, env, episode, evaluation, scene, sim2sim, stand_in
