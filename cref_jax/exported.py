@@ -29,14 +29,7 @@ BUNDLED = "gap"  # the policy that comes with the package
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
 STALE = 0.1  # s, two frames of the camera
 MOST_INVALID = 0.5  # of a frame's pixels; assumed: beyond, the last frame tells more
-ZIPPED = (
-    1980,
-    1,
-    1,
-    0,
-    0,
-    0,
-)  # of every file in an archive, so that equal policies are equal bytes
+ZIPPED = (1980, 1, 1, 0, 0, 0)  # date of every file: equal policies are equal bytes
 
 
 def write(policy: Policy, world: World, out: Path) -> None:
@@ -61,6 +54,8 @@ def refresh(path: Path) -> None:
         ConfigError: it is no policy, or the disk refused.
     """
     content, _ = _contents(path)
+    if not path.is_dir():
+        raise ConfigError(f"{path} is not a directory")
     files = {name: (path / name).read_bytes() for name in content["files"]}
     files["cref_runtime.py"] = Path(deploy.__file__).read_bytes()
     _write(path, content, files)

@@ -19,7 +19,6 @@ from cref_jax.deploy import Policy, Status
 MOST_BOXES = 20_000
 MARGIN = 4.0  # m around the lane where its border goes on, as in training; further than is seen
 FAR = 1e3  # m, a ray that meets nothing
-BY_PD = Status.BAD_INPUT | Status.BAD_ACTION | Status.HOLDING | Status.DAMPING
 GROUND, SEEN, UNSEEN = 0, 1, 2  # geom groups; rays meet the first two
 
 
