@@ -12,7 +12,7 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves", "layers"},
+    {"config", "geometry", "deploy", "leaves", "layers", "stall"},
     {"terrain", "shapes", "robot", "host_call", "film"},
     {"kinematics", "lanes", "host_physics"},
     {"physics", "depth", "foothold"},
