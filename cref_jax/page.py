@@ -69,10 +69,12 @@ code { font: 0.9em ui-monospace, monospace; background: var(--card); padding: 0.
 .tiles b { display: block; font-size: 1.5rem; line-height: 1.3; }
 .tiles span { color: var(--faint); font-size: 0.9rem; }
 .scroll { overflow-x: auto; margin: 0.6rem 0; }
-table { border-collapse: collapse; font-size: 0.92rem; font-variant-numeric: tabular-nums; }
+table { width: max-content; border-collapse: collapse; font-size: 0.92rem;
+  font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding: 0.2rem 0; }
 th, td { padding: 0.25rem 0.7rem 0.25rem 0; text-align: left; vertical-align: top;
   border-bottom: 1px solid var(--line); }
+td { max-width: 28rem; }
 thead th { vertical-align: bottom; font-size: 0.85rem; color: var(--faint); }
 tbody th { font-weight: 500; white-space: nowrap; }
 .number { text-align: right; white-space: nowrap; }
@@ -82,6 +84,7 @@ dt { color: var(--faint); }
 dd { margin: 0; }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(21rem, 100%), 1fr));
   gap: 0.8rem; margin: 0.8rem 0; }
+.wide { grid-template-columns: repeat(auto-fill, minmax(min(33rem, 100%), 1fr)); }
 figure { margin: 0; min-width: 0; }
 figure img { background: #fff; border-radius: 6px; padding: 6px; max-width: 100%; height: auto; }
 .charts img { width: 100%; border: 1px solid var(--line); }
@@ -202,6 +205,11 @@ def nested(sections: Iterable[Section]) -> Html:
 def charts(*drawn: Html) -> Html:
     """Return charts side by side, as many as there is room for."""
     return element("div", *drawn, class_="charts")
+
+
+def wide(*drawn: Html) -> Html:
+    """Return charts of many rows, larger than those of `charts`."""
+    return element("div", *drawn, class_="charts wide")
 
 
 def chart(
