@@ -20,7 +20,7 @@ TITLES = {
     "table": "Success on stairs, gaps and platforms",
     "ood": "Success on scenes that were never trained on",
     "walk": "Walking on flat ground",
-    "cross": "Crossing one kind of obstacle",
+    "cross": "Crossing obstacles",
 }
 PLAIN = {  # of the suites walk and cross: name in the record: words, and unit
     "kind": ("kind of obstacle", ""),
@@ -50,7 +50,8 @@ def write(record: Record, out: Path) -> None:
 def title(record: Record) -> str:
     """Return what was measured, in a few words."""
     suite = str(record.get("suite", "unknown"))
-    return TITLES.get(suite, f"Evaluation {suite}")
+    words = TITLES.get(suite, f"Evaluation {suite}")
+    return f"{words}: {_name(record)}" if suite == "cross" else words
 
 
 def lead(record: Record) -> Html:
@@ -285,8 +286,10 @@ def _causes(name: str, of: Record) -> Failures:
 
 
 def _name(cell: Record) -> str:
+    """Return the kind, level and size of a cell, as far as they are known."""
+    words = " ".join(str(cell[key]) for key in ("kind", "level") if key in cell)
     size = cell.get("size_m")
-    return f"{cell['kind']} {cell['level']}" + (f", {_centimetres(size)}" if size else "")
+    return f"{words}, {_centimetres(size)}" if size else words
 
 
 def _called(scene: Record) -> str:

@@ -15,7 +15,7 @@ MOST_POINTS = 600  # of a curve: one a pixel, and more
 WINDOWS = 150  # that a log is divided into; a point is the mean over one of them
 LEAST_WINDOW = 10  # iterations
 INK, MARK = "#1d4e80", "#b5432a"
-SMALL = (3.4, 1.9)  # inches, of a reward term
+SMALL = (page.CHART[0], 2.2)  # inches, of a reward term
 
 TITLES = {  # of the log: what it is, with its unit
     "episode/length_s": "episode length, s",
@@ -32,10 +32,10 @@ GROUPS = {  # names in the log that begin so: one chart for all kinds of lanes
     "fell/": "share of episodes that fall",
 }
 LOGARITHMIC = ("train/learning_rate",)
-NEWEST = {  # shown at the top of a page: what it is, and its unit
-    "episode/length_s": ("episode length", " s"),
-    "walk/speed_error": ("speed error with exploration", " m/s"),
-    "samples_per_s": ("samples a second", ""),
+NEWEST = {  # shown at the top of a page: how, and what it is
+    "episode/length_s": ("{:.1f} s", "episode length"),
+    "walk/speed_error": ("{:.3f} m/s", "speed error with exploration"),
+    "samples_per_s": ("{:,.0f}", "samples a second"),
 }
 HIDDEN = ("iteration", "train/samples", "loss/learning_rate", "episode/ended", "episode/fell")
 
@@ -86,13 +86,13 @@ def sections(
 
 
 def newest(log: Log) -> Iterator[tuple[str, str]]:
-    """Return what the log said last, with what it is."""
+    """Return what the log says at its end, and what it is."""
     of = Curves(log, (), None)
-    for name, (title, unit) in NEWEST.items():
+    for name, (form, title) in NEWEST.items():
         if name in log:
-            value = curves.smooth(log, name, of.window)[-1]
-            digits = f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
-            yield f"{title}, mean of the last {of.window} iterations", f"{digits}{unit}"
+            value = float(curves.smooth(log, name, of.window)[-1])
+            shown = form.format(value) if math.isfinite(value) else page.MISSING
+            yield shown, f"{title}, last {of.window} iterations"
 
 
 def _words(of: Curves, starts: int) -> Html:

@@ -66,7 +66,7 @@ code { font: 0.9em ui-monospace, monospace; background: var(--card); padding: 0.
 .tiles { display: flex; flex-wrap: wrap; gap: 0.8rem; margin: 1rem 0; }
 .tiles div { background: var(--card); border-radius: 8px; padding: 0.6rem 1rem;
   flex: 1 1 9rem; max-width: 22rem; }
-.tiles b { display: block; font-size: 1.5rem; line-height: 1.3; }
+.tiles b { display: block; white-space: nowrap; font-size: 1.4rem; line-height: 1.3; }
 .tiles span { color: var(--faint); font-size: 0.9rem; }
 .scroll { overflow-x: auto; margin: 0.6rem 0; }
 table { width: max-content; border-collapse: collapse; font-size: 0.92rem;
@@ -78,8 +78,8 @@ td { max-width: 28rem; }
 thead th { vertical-align: bottom; font-size: 0.85rem; color: var(--faint); }
 tbody th { font-weight: 500; white-space: nowrap; }
 .number { text-align: right; white-space: nowrap; }
-dl { display: grid; grid-template-columns: max-content minmax(0, 1fr); gap: 0.2rem 1.2rem;
-  margin: 0.6rem 0; }
+dl { display: grid; grid-template-columns: fit-content(45%) minmax(0, 1fr);
+  gap: 0.2rem 1.2rem; margin: 0.6rem 0; }
 dt { color: var(--faint); }
 dd { margin: 0; }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(21rem, 100%), 1fr));
@@ -89,11 +89,10 @@ figure { margin: 0; min-width: 0; }
 figure img { background: #fff; border-radius: 6px; padding: 6px; max-width: 100%; height: auto; }
 .charts img { width: 100%; border: 1px solid var(--line); }
 .media { margin: 1rem 0; }
+.media img { padding: 0; }
 video { width: 100%; max-width: 60rem; border-radius: 6px; background: #000; }
 details { margin: 0.8rem 0; }
 summary { cursor: pointer; color: var(--link); }
-@media (max-width: 34rem) { dl { grid-template-columns: 1fr; gap: 0; }
-  dd { margin-bottom: 0.5rem; } }
 @media print { :root { --ink: #000; --paper: #fff; --card: #fff; --line: #bbb; --faint: #444;
   --link: #000; } body { max-width: none; font-size: 10pt; }
   nav { display: none; } figure, tr, .tiles div { break-inside: avoid; }

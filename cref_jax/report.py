@@ -73,7 +73,7 @@ def _policy_document(path: Path) -> str:
             (content["network"]["variant"], "network"),
         ]
     )
-    return page.document(path.resolve().name, lead, sections, run_page.foot())
+    return page.document(f"Policy {path.resolve().name}", lead, sections, run_page.foot())
 
 
 def _overview(content: dict[str, Any], path: Path) -> Html:
@@ -85,7 +85,7 @@ def _overview(content: dict[str, Any], path: Path) -> Html:
         [
             ("folder", code(str(path))),
             ("run", str(origin["run"])),
-            ("exported", str(origin["exported"])),
+            ("exported", run_page.moment(origin["exported"])),
             ("control", f"{rates['control_hz']:g} Hz"),
             ("depth", f"{rates['depth_hz']:g} Hz" if content.get("depth") else "none: it is blind"),
             ("command forward", f"{limits[0]} m/s"),

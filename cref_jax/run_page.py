@@ -63,13 +63,13 @@ def document(run: Run) -> str:
     """Return the page of a run."""
     sections = [
         Section("What it is", _overview(run)),
+        *_evaluations(run),
+        Section("Pictures and films", _media(run.folder)),
+        *_learning(run),
         Section("Where it comes from", provenance(run.starts)),
         Section("Settings", settings(run.settings)),
-        *_learning(run),
-        *_evaluations(run),
-        *_media(run.folder),
     ]
-    return page.document(run.folder.resolve().name, _lead(run), sections, foot())
+    return page.document(f"Run {run.folder.resolve().name}", _lead(run), sections, foot())
 
 
 def foot() -> str:
@@ -84,13 +84,14 @@ def settings(given: Settings) -> Html:
     names = list(dict.fromkeys([*defaults, *ours]))
     changed = [name for name in names if ours.get(name) != defaults.get(name)]
     shown = lambda values, name: json.dumps(values[name]) if name in values else MISSING
-    columns = [Column("setting"), Column("here", True), Column("default", True)]
+    columns = [Column("setting"), Column("here"), Column("default")]
     rows = [(code(name), shown(ours, name), shown(defaults, name)) for name in changed]
     everything = [(code(name), json.dumps(value)) for name, value in ours.items()]
     return join(
-        page.table(columns, rows, "Settings that differ from the defaults, which are the paper's")
+        paragraph("These settings differ from the defaults, which are the paper's.")
         if changed
-        else paragraph("Every setting is the default."),
+        else paragraph("Every setting is the default, which is the paper's."),
+        page.table(columns, rows) if changed else Html(),
         page.folded(f"All {len(ours)} settings", page.table(columns[:2], everything)),
     )
 
@@ -99,12 +100,12 @@ def provenance(starts: tuple[Mapping[str, Any], ...]) -> Html:
     """Return when, how and with what a run was started."""
     if not starts:
         return note("It is not known: origin.jsonl is missing or empty.")
-    columns = [Column("start (UTC)"), Column("from iteration", True), Column("command")]
+    columns = [Column("start"), Column("done before", True), Column("command")]
     columns += [Column("device"), Column("cores", True), Column("git")]
     rows = [
         (
-            str(start.get("time", MISSING)).replace("T", " ").removesuffix("+00:00"),
-            str(start.get("iteration", MISSING)),
+            moment(start.get("time")),
+            _count(start.get("iteration")),
             code(_command(start.get("command"))),
             str(start.get("device", MISSING)),
             str(start.get("cores", MISSING)),
@@ -113,11 +114,12 @@ def provenance(starts: tuple[Mapping[str, Any], ...]) -> Html:
         for start in starts
     ]
     versions = [
-        (name, " → ".join(dict.fromkeys(str(s[name]) for s in starts if name in s)))
+        f"{name} {', then '.join(dict.fromkeys(str(s[name]) for s in starts if name in s))}"
         for name in PACKAGES
         if any(name in start for start in starts)
     ]
-    return join(page.table(columns, rows), page.pairs(versions))
+    made_by = paragraph(f"Versions: {'; '.join(versions)}.") if versions else Html()
+    return join(page.table(columns, rows), made_by)
 
 
 def evaluation(record: Any, source: str, iteration: int | None = None) -> Html:
@@ -132,6 +134,11 @@ def evaluation(record: Any, source: str, iteration: int | None = None) -> Html:
     if iteration is not None and isinstance(of, int) and of < iteration:
         shown.insert(0, note(f"It is of iteration {of:,}; the run has come to {iteration:,}."))
     return join(*shown)
+
+
+def moment(iso: Any) -> str:
+    """Return a time as people write it."""
+    return str(iso or MISSING).replace("T", " ").replace("+00:00", " UTC")
 
 
 def _starts(folder: Path) -> Iterator[dict[str, Any]]:
@@ -159,8 +166,7 @@ def _lead(run: Run) -> Html:
         values.append((f"{log['train/samples'][-1] / 1e6:.1f} M", "samples"))
         if "samples_per_s" in log:
             values.append((_duration(float(log.minutes()[-1])), "of training"))
-    values += [(value, title) for title, value in learning_charts.newest(log)]
-    return page.tiles(values)
+    return page.tiles([*values, *learning_charts.newest(log)])
 
 
 def _overview(run: Run) -> Html:
@@ -198,8 +204,8 @@ def _learning(run: Run) -> Iterator[Section]:
         words = note(f"{run.no_log}. Training writes it: ", _make("train", run.folder, "--resume"))
         yield Section("Learning curves", words)
         return
-    begun = [start.get("iteration") for start in run.starts[1:]]
-    marks = sorted({*run.log.repeated, *(i for i in begun if isinstance(i, int))})
+    done = [start.get("iteration") for start in run.starts[1:]]
+    marks = sorted({*run.log.repeated, *(i + 1 for i in done if isinstance(i, int))})
     target = _of(run.settings, "ppo", "target_kl")
     yield from learning_charts.sections(
         run.log, marks, float(target) if isinstance(target, int | float) else None, len(run.starts)
@@ -231,7 +237,7 @@ def _evaluations(run: Run) -> Iterator[Section]:
         yield Section("Evaluation", words)
 
 
-def _media(folder: Path) -> Iterator[Section]:
+def _media(folder: Path) -> Html:
     """Return the pictures and films of the folder, the newest first, while there is room."""
     kinds = (".png", ".mp4")
     files = [p for p in folder.iterdir() if p.suffix.lower() in kinds and p.is_file()]
@@ -245,7 +251,7 @@ def _media(folder: Path) -> Iterator[Section]:
         left -= size if size <= most else 0
     if not any(path.suffix.lower() == ".mp4" for path in files):
         shown.append(note("There is no film of it yet: ", _make("play", folder)))
-    yield Section("Pictures and films", join(*shown))
+    return join(*shown)
 
 
 def _make(target: str, folder: Path, *more: str) -> Html:

@@ -60,11 +60,15 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path) -> None:
-    """Add a line with what this start of the run is made by: versions, device, command, git."""
+def write_origin(run: Path, iteration: int = 0) -> None:
+    """Add a line with what this start of the run is made by: versions, device, command, git.
+
+    `iteration` is how many are done before it.
+    """
     packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "iteration": iteration,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
         "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
