@@ -15,6 +15,7 @@ from cref_jax.outcomes import Failures, Line, Share, called
 from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
 
 Record = Mapping[str, Any]
+Number = int | float  # JSON has both for one thing
 
 TITLES = {
     "table": "Success on stairs, gaps and platforms",
@@ -166,8 +167,8 @@ def _widths(cells: Sequence[Record]) -> Html:
     theirs = sorted({p["trials"] for c in cells if (p := c.get("paper") or {}).get("trials")})
     return paragraph(
         f"With {many} trials a cell, the 95 % intervals (Wilson) reach {half[0]:.1f} to "
-        f"{half[-1]:.1f} points to either side. They hold what chance does to the trials, and not "
-        "what another training with another seed would give. "
+        f"{half[-1]:.1f} points to either side. They cover the chance in the trials alone, not "
+        "what training anew with another seed would change. "
         + (f"The paper counts {theirs[-1]} trials a cell. " if theirs else "")
         + "A difference that is within chance says nothing."
     )
@@ -296,11 +297,11 @@ def _called(scene: Record) -> str:
     return str(scene.get("title") or scene["name"])
 
 
-def _centimetres(size: float | None) -> str:
+def _centimetres(size: Number | None) -> str:
     return MISSING if size is None else f"{100.0 * size:.3g} cm"
 
 
-def _paper(rate: float, theirs: float | None) -> str:
+def _paper(rate: Number, theirs: Number | None) -> str:
     """Return what the paper has, and how far that is from here."""
     if theirs is None:
         return ""
@@ -325,15 +326,15 @@ def _each(cell: Record) -> str:
     return ", ".join(f"{100.0 * rate:.1f}" for rate in cell.get("by_policy") or ()) or MISSING
 
 
-def _points(rate: float | None) -> str:
+def _points(rate: Number | None) -> str:
     return MISSING if rate is None else f"{100.0 * rate:.1f}"
 
 
-def _percent(rate: float | None) -> str:
+def _percent(rate: Number | None) -> str:
     return MISSING if rate is None or math.isnan(rate) else f"{100.0 * rate:.1f} %"
 
 
-def _exact(rate: float | None) -> str:
+def _exact(rate: Number | None) -> str:
     """Return a rate of the paper with its two digits."""
     return MISSING if rate is None else f"{100.0 * rate:.2f} %"
 
@@ -342,7 +343,7 @@ def _interval(of: Record) -> str:
     return f"{100.0 * of['wilson_low']:.1f} to {100.0 * of['wilson_high']:.1f} %"
 
 
-def _count(number: float | None) -> str:
+def _count(number: Number | None) -> str:
     return MISSING if number is None else f"{number:,}"
 
 

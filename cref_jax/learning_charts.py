@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatter
 
 from cref_jax import curves, page
 from cref_jax.curves import Log
@@ -100,7 +101,7 @@ def _words(of: Curves, starts: int) -> Html:
     log, count = of.log, len(of.log["iteration"])
     words = [f"A point is the mean of the last {of.window} of {count:,} iterations."]
     if of.marks:
-        at = ", ".join(f"{mark:,}" for mark in of.marks)
+        at = ", ".join(map(str, of.marks))
         words.append(f"A dotted line stands where the run was started anew (iteration {at}).")
     if starts - 1 > len(of.marks):
         words.append(
@@ -130,20 +131,22 @@ def _chart(
             axis.axvline(x[place], color=MARK, lw=0.9, ls=":")
         if "loss/kl" in names and of.target_kl:
             axis.axhline(of.target_kl, color="0.5", lw=0.9, ls="--", label="target")
-            several = True
-        _dress(axis, title, names, "train/samples" in of.log)
-        if several:
             axis.legend()
+        if several:
+            axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        _dress(axis, title, names, "train/samples" in of.log)
 
     return page.chart(paint, title, size=size)
 
 
 def _dress(axis: Axes, title: str, names: Sequence[str], samples: bool) -> None:
     """Set titles and limits; what cannot be negative begins at zero."""
-    axis.set_title(title.replace("$", r"\$"))
+    axis.set_title(title)
     axis.set_xlabel("samples, millions" if samples else "iterations")
     if set(names) <= set(LOGARITHMIC):
         axis.set_yscale("log")
+        axis.yaxis.set_major_formatter(LogFormatter())  # the usual one writes formulas
+        axis.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         return
     low, high = axis.get_ylim()
     if low > 0.0 or (low <= 0.0 and low > -0.06 * high):

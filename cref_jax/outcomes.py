@@ -127,14 +127,9 @@ def _colour(cause: str) -> str:
 
 
 def _rows(axis: Axes, names: list[str]) -> None:
-    axis.set_yticks(np.arange(len(names)), [_plain(name) for name in names])
+    axis.set_yticks(np.arange(len(names)), names)
     axis.set_ylim(len(names) - 0.4, -0.6)
     axis.grid(axis="y", visible=False)
-
-
-def _plain(name: str) -> str:
-    """Return a name so that matplotlib takes no part of it for a formula."""
-    return name.replace("$", r"\$")
 
 
 def _legend(axis: Axes) -> None:

@@ -6,6 +6,7 @@ the page's head forbids the rest, should one of them ever fail.
 """
 
 import base64
+import contextlib
 import html
 import io
 import re
@@ -43,6 +44,7 @@ CHART_STYLE = {
     "legend.frameon": False,
     "svg.fonttype": "path",  # letters as outlines: the same everywhere, whatever fonts there are
     "svg.hashsalt": "cref_jax",  # equal charts are equal bytes
+    "text.parse_math": False,  # a name with two dollars is no formula
 }
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d2129; --faint: #5c6470; --paper: #fff;
@@ -74,17 +76,18 @@ table { width: max-content; border-collapse: collapse; font-size: 0.92rem;
 caption { text-align: left; padding: 0.2rem 0; }
 th, td { padding: 0.25rem 0.7rem 0.25rem 0; text-align: left; vertical-align: top;
   border-bottom: 1px solid var(--line); }
-td { max-width: 28rem; }
-thead th { vertical-align: bottom; font-size: 0.85rem; color: var(--faint); }
+td { max-width: 36rem; }
+thead th { vertical-align: bottom; max-width: 8rem; font-size: 0.92em; color: var(--faint); }
 tbody th { font-weight: 500; white-space: nowrap; }
-.number { text-align: right; white-space: nowrap; }
+.number { text-align: right; }
+td.number { white-space: nowrap; }
 dl { display: grid; grid-template-columns: fit-content(45%) minmax(0, 1fr);
   gap: 0.2rem 1.2rem; margin: 0.6rem 0; }
 dt { color: var(--faint); }
 dd { margin: 0; }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(21rem, 100%), 1fr));
   gap: 0.8rem; margin: 0.8rem 0; }
-.wide { grid-template-columns: repeat(auto-fill, minmax(min(33rem, 100%), 1fr)); }
+.wide { grid-template-columns: repeat(auto-fill, minmax(min(24rem, 100%), 1fr)); }
 figure { margin: 0; min-width: 0; }
 figure img { background: #fff; border-radius: 6px; padding: 6px; max-width: 100%; height: auto; }
 .charts img { width: 100%; border: 1px solid var(--line); }
@@ -97,6 +100,7 @@ summary { cursor: pointer; color: var(--link); }
   --link: #000; } body { max-width: none; font-size: 10pt; }
   nav { display: none; } figure, tr, .tiles div { break-inside: avoid; }
   h2, h3 { break-after: avoid; } .scroll { overflow: visible; }
+  table { width: auto; font-size: 8pt; }
   details::details-content { content-visibility: visible; block-size: auto; } }
 """
 
@@ -155,11 +159,8 @@ def note(*content: str) -> Html:
 
 def tiles(values: Iterable[tuple[str, str]]) -> Html:
     """Return the few figures that matter most, each with what it is."""
-    return element(
-        "div",
-        *(element("div", element("b", value), element("span", what)) for value, what in values),
-        class_="tiles",
-    )
+    each = [element("div", element("b", value), element("span", what)) for value, what in values]
+    return element("div", *each, class_="tiles") if each else Html()
 
 
 def pairs(values: Iterable[tuple[str, str]]) -> Html:
@@ -225,7 +226,7 @@ def chart(
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(file, format="svg", metadata=nothing)
     # a hundredth of a point is finer than a screen, and half the bytes
-    short = re.sub(r"^ *[ML] .*$", _rounded, file.getvalue(), flags=re.MULTILINE)
+    short = re.sub(r"[ML] -?[\d.]+ -?[\d.]+ ", _rounded, file.getvalue())
     return _image("image/svg+xml", short.encode(), alt, caption)
 
 
@@ -306,12 +307,13 @@ def write(out: Path, document: str) -> None:
         part.write_text(document, encoding="utf-8")
         part.replace(out)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
         raise ConfigError(f"cannot write {out}: {error.strerror}") from None
 
 
-def _rounded(line: re.Match[str]) -> str:
-    return re.sub(r"\d+\.\d{3,}", lambda number: f"{float(number[0]):.2f}", line[0])
+def _rounded(point: re.Match[str]) -> str:
+    return re.sub(r"\d+\.\d{3,}", lambda number: f"{float(number[0]):.2f}", point[0])
 
 
 def _inside(kind: str, content: bytes) -> str:

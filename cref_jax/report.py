@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
             out = options.out or source / "report.html"
             document = run_page.document(run_page.read(source))
         page.write(out, document)
-        print(f"wrote {out}, {out.stat().st_size / page.MEGABYTE:.1f} MB; open it in any browser")
+        print(f"wrote {out}, {out.stat().st_size / 1000:,.0f} kB; open it in any browser")
 
 
 def _policy_document(path: Path) -> str:

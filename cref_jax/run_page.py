@@ -227,7 +227,9 @@ def _evaluations(run: Run) -> Iterator[Section]:
         else:
             shown[suite] = (path.name, record)
     newest = max(run.checkpoints, default=None)
-    for name, record in shown.values():
+    order = [suite for suite in evaluation_page.TITLES if suite in shown]
+    order += [suite for suite in shown if suite not in order]
+    for name, record in map(shown.__getitem__, order):
         title = evaluation_page.title(record) if isinstance(record, dict) else name
         yield Section(title, evaluation(record, name, newest))
     if older:
