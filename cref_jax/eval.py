@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cref_jax import cli, evaluation, exported, paper, runs, table
+from cref_jax import cli, evaluation, evaluation_page, exported, paper, runs, table
 from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.world import World
@@ -45,7 +45,7 @@ class Options:
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx on the device"""
     out: Path | None = None
-    """folder for eval.json; the run's own when left out, or the present one"""
+    """folder for eval.json and eval.html; the run's own when left out, or the present one"""
     debug: bool = False
     """show the traceback of an error"""
 
@@ -138,7 +138,7 @@ def _origin(subjects: list[Subject]) -> dict[str, Any]:
     policies = [
         {
             "name": subject.policy.run.name,
-            "source": str(subject.source),
+            "source": subject.source.name if subject.source.is_absolute() else str(subject.source),
             "digest": exported.digest(subject.policy),
             "iteration": subject.policy.iteration,
             "samples": subject.policy.samples,
@@ -178,14 +178,15 @@ def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _write(out: Path, record: dict[str, Any]) -> None:
-    """Write eval.json."""
+    """Write eval.json, and the same as a page for people."""
     path = out / "eval.json"
     try:
         out.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(record, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-    print(f"wrote {path}")
+    evaluation_page.write(record, out / "eval.html")
+    print(f"wrote {path} and eval.html")
 
 
 if __name__ == "__main__":

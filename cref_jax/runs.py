@@ -65,10 +65,14 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path) -> None:
-    """Add a line with what this start of the run is made by: versions, device, command, git."""
+def write_origin(run: Path, iteration: int = 0) -> None:
+    """Add a line with what this start of the run is made by: versions, device, command, git.
+
+    `iteration` is how many are done before it.
+    """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "iteration": iteration,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
         **machine(),

@@ -13,16 +13,16 @@ NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
     {"config", "geometry", "deploy", "leaves", "layers", "paper", "proportion", "stall"},
-    {"terrain", "shapes", "robot", "host_call", "film"},
-    {"kinematics", "lanes", "host_physics"},
-    {"physics", "depth", "foothold"},
+    {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
+    {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts"},
+    {"physics", "depth", "foothold", "evaluation_page"},
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in", "table"},
+    {"runs", "peers", "stand_in", "table", "run_page"},
     {"exported"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
