@@ -7,7 +7,7 @@ the highest level, and gives what else their shapes need. A user's own height ma
 import dataclasses
 import difflib
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
@@ -72,12 +72,33 @@ def build(c: config.Terrain) -> Atlas:
     return _atlas(c, numbers, sizes)
 
 
-def single(c: config.Terrain, kind: str, size: float) -> Atlas:
-    """Return one lane of one kind whose obstacles have exactly this size, m."""
+def single(c: config.Terrain, kind: str, size: float, shape: dict[str, Any] | None = None) -> Atlas:
+    """Return one lane of one kind whose obstacles have exactly this size, m.
+
+    `shape` changes what its terrain file says of the shape, such as {"tread": [0.30]}.
+    """
     _check_lane(c)
     if not size >= 0.0:
         raise ConfigError(f"the size of '{kind}' must not be below zero: {size}")
-    return _atlas(c, {kind: _numbers_of(c, kind)}, np.array([[size]]))
+    numbers, where = _numbers_of(c, kind), f"shape of '{kind}'"
+    _check_shape(shape or {}, where)
+    changed = config.override(numbers.shape, shape or {}, where=f"{where}: ")
+    return _atlas(c, {kind: numbers._replace(shape=changed)}, np.array([[size]]))
+
+
+def beside(atlases: Sequence[Atlas]) -> Atlas:
+    """Return lanes of the same extent and number of levels as one atlas, their kinds in turn."""
+    first = atlases[0]
+    heights = [np.asarray(atlas.terrain.heights) for atlas in atlases]
+    x, y = np.asarray(first.terrain.origin)
+    grid = np.concatenate(heights, axis=1)
+    return Atlas(
+        terrain=terrain.from_heights(grid, first.terrain.cell, (float(x), float(y))),
+        sizes=np.concatenate([atlas.sizes for atlas in atlases], axis=1),
+        kinds=tuple(kind for atlas in atlases for kind in atlas.kinds),
+        columns=first.columns,
+        is_profile=tuple(flag for atlas in atlases for flag in atlas.is_profile),
+    )
 
 
 def named_sizes(c: config.Terrain, kind: str) -> dict[str, float]:

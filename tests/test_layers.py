@@ -14,7 +14,7 @@ NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 LAYERS = [
     {"config", "geometry", "deploy", "leaves", "layers"},
     {"terrain", "shapes", "robot", "host_call", "film"},
-    {"kinematics", "lanes", "host_physics"},
+    {"kinematics", "lanes", "host_physics", "profile"},
     {"physics", "depth", "foothold"},
     {"world", "observation", "reward"},
     {"episode"},
@@ -23,6 +23,7 @@ LAYERS = [
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"runs", "peers", "stand_in"},
     {"exported"},
+    {"watch"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

@@ -1,0 +1,182 @@
+"""What E robots and their policy do at each step: what the laboratories in experiments/ share.
+
+A laboratory opens a policy, puts robots on lanes side by side, and says what it wants to know of
+each step. Nothing counts from the step on that ends a robot's first episode.
+"""
+
+import csv
+import dataclasses
+import functools
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+from rich.progress import Progress
+
+from cref_jax import evaluation, exported, lanes, network, ppo, rollout, runs
+from cref_jax.config import Config, ConfigError
+from cref_jax.env import Outcome
+from cref_jax.lanes import Atlas
+from cref_jax.physics import EngineName
+from cref_jax.runs import Policy
+from cref_jax.world import World
+
+CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
+ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
+
+Seen = TypeVar("Seen", bound=tuple)
+
+
+class Moment(NamedTuple):
+    """One control step of E robots."""
+
+    robots: rollout.Robots  # before it: what the policy acts on
+    policy: network.Output  # what it says, [1, E, ...]
+    outcome: Outcome
+    after: rollout.Robots  # a robot that has come to its end stands at its next start
+
+
+class Watched(NamedTuple, Generic[Seen]):
+    """What was looked at during T steps of E robots."""
+
+    alive: Bool[np.ndarray, "T E"]  # no end has come, neither before this step nor by it
+    seen: Seen  # arrays [T, E, ...], of which only those of `alive` count
+
+
+def opened(run: Path | None, policy: Path | None, engine: EngineName) -> tuple[Policy, World]:
+    """Return the policy that was asked for, or the newest there is, and the world of its training.
+
+    Raises:
+        ConfigError: it is no policy, or both are given.
+        CheckpointError: the run has no checkpoint that can be read.
+    """
+    source = exported.chosen(run, policy)
+    world = runs.world_of(exported.read_config(source), engine)
+    return exported.load(source, world)._replace(run=source), world
+
+
+def placed(c: Config, world: World, atlases: Sequence[Atlas], command: float) -> World:
+    """Return the world with these lanes side by side, to be walked at `command`, m/s forward.
+
+    Raises:
+        ConfigError: the command is not above zero.
+    """
+    if not 0.0 < command < math.inf:
+        raise ConfigError(f"--command must be above 0 m/s, not {command:g}")
+    judged = evaluation.crossing_world(c, world.physics, "flat", 0.0)
+    ask = dataclasses.replace(judged.config.command, lane_vx=(command, command))
+    return judged.replace(
+        config=dataclasses.replace(judged.config, command=ask), lanes=lanes.beside(atlases)
+    )
+
+
+def crowd(asked: int | None, on_accelerator: int) -> int:
+    """Return how many robots to watch: as many as asked for, or as the device does in a minute.
+
+    Raises:
+        ConfigError: fewer than one are asked for.
+    """
+    if asked is None:
+        return ON_CPU if jax.default_backend() == "cpu" else on_accelerator
+    if asked < 1:
+        raise ConfigError(f"--num-envs must be at least 1, not {asked}")
+    return asked
+
+
+def steps_of(seconds: float, c: Config) -> int:
+    """Return the number of control steps in a time, at least one.
+
+    Raises:
+        ConfigError: the time is not above 0, or above a trial's.
+    """
+    most = evaluation.CROSSING_SECONDS
+    if not 0.0 < seconds <= most:
+        raise ConfigError(f"--seconds must be above 0, up to {most:g}, not {seconds:g}")
+    return max(1, round(seconds / c.physics.control_period))
+
+
+def watch(
+    world: World,
+    train: ppo.TrainState,
+    robots: rollout.Robots,
+    steps: int,
+    look: Callable[[World, Moment], Seen],
+) -> Watched[Seen]:
+    """Let the policy's mean action walk the robots, and return what `look` saw of each step.
+
+    It is over after `steps`, or a second after the last robot's end.
+    """
+    alive = jnp.ones(robots.begins.shape, bool)
+    parts: list[Watched[Seen]] = []
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
+        task = bar.add_task("walking", total=steps)
+        while steps > 0 and alive.any():
+            count = min(CHUNK, steps)
+            (robots, alive), part = _chunk(world, train, (robots, alive), look, count)
+            parts.append(jax.tree.map(np.asarray, part))
+            steps -= count
+            bar.advance(task, count)
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@functools.partial(jax.jit, static_argnames=("look", "count"))
+def _chunk(
+    world: World,
+    train: ppo.TrainState,
+    carry: tuple[rollout.Robots, Bool[Array, " E"]],
+    look: Callable[[World, Moment], Any],
+    count: int,
+) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], Watched]:
+    """Return the robots after `count` steps, and what was seen of these."""
+    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+
+    def step(
+        carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
+    ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], Watched]:
+        robots, alive = carry
+        memory, policy = rollout.act(nets, train, robots)
+        after, outcome = rollout.advance(world, robots, memory, policy.mean[0])
+        alive &= ~(outcome.ending.terminated | outcome.ending.truncated)
+        seen = look(world, Moment(robots, policy, outcome, after))
+        return (after, alive), Watched(alive, seen)
+
+    return jax.lax.scan(step, carry, None, length=count)
+
+
+def onsets(flag: Bool[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+    """Return where a flag goes up along the first axis, time; one that is up at first does."""
+    before = np.concatenate([np.zeros_like(flag[:1]), flag[:-1]])
+    return flag & ~before
+
+
+def picture(out: Path) -> Path:
+    """Return the picture to write, its folder made; the table stands beside it, as .csv.
+
+    Raises:
+        ConfigError: it is no .png, or cannot be written.
+    """
+    if out.suffix != ".png":
+        raise ConfigError(f"--out must end in .png: {out}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
+    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
+        raise ConfigError(f"cannot write {out}")
+    return out
+
+
+def write_table(out: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a .csv: a header, then the rows, numbers with up to six digits."""
+    said = lambda x: f"{x:.6g}" if isinstance(x, float | np.floating) else x
+    with out.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows([said(x) for x in row] for row in rows)
