@@ -58,17 +58,19 @@ def landed(
     x: Float[np.ndarray, " P"],
     z: Float[np.ndarray, " P"],
     reach: float,
+    most: float,
 ) -> Landed:
     """Return where feet have come down, from the centres of their soles, m.
 
     A foot is on the section nearest to it in height, of those under the centre or within `reach` of
-    it: one whose centre is beyond the nosing stands on the tread that holds its heel or toes. The
-    nosing is a tread's lower edge: its near end on the way up, its far end on the way down.
+    it: one whose centre is beyond the nosing stands on the tread that holds its heel or toes. What
+    is more than `most` above or below that section has touched something else, such as a riser.
+    The nosing is a tread's free edge: its near end on the way up, its far end on the way down.
     """
     near = (x[:, None] >= profile.left - reach) & (x[:, None] <= profile.right + reach)
     apart = np.where(near, np.abs(z[:, None] - profile.height), np.inf)
     at = np.argmin(apart, axis=1)
-    flight = np.where(near.any(axis=1), profile.flight[at], 0)
+    flight = np.where(apart.min(axis=1) <= most, profile.flight[at], 0)
     from_nosing = np.where(flight == UP, x - profile.left[at], profile.right[at] - x)
     return Landed(np.where(flight == 0, np.nan, from_nosing), flight)
 
@@ -82,11 +84,3 @@ def flight_at(profile: Profile, x: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "
 def edges(profile: Profile) -> Float[np.ndarray, " risers"]:
     """Return x of each riser, m."""
     return profile.right[:-1]
-
-
-def stretch(heights: Float[np.ndarray, "X Y"], cell: float) -> tuple[float, float]:
-    """Return from where to where a lane is not at z = 0, m; (0, its length) for level ground."""
-    uneven = np.flatnonzero(heights.any(axis=1))
-    if not uneven.size:
-        return 0.0, len(heights) * cell
-    return float(uneven[0] * cell), float((uneven[-1] + 1) * cell)

@@ -17,18 +17,20 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Shaped
 from rich.progress import Progress
 
-from cref_jax import evaluation, exported, lanes, network, ppo, rollout, runs
+from cref_jax import evaluation, exported, lanes, network, ppo, profile, rollout, runs, scene
 from cref_jax.config import Config, ConfigError
 from cref_jax.env import Outcome
 from cref_jax.lanes import Atlas
 from cref_jax.physics import EngineName
 from cref_jax.runs import Policy
+from cref_jax.terrain import Terrain
 from cref_jax.world import World
 
 CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
+BEFORE = 0.5  # m before an obstacle from where a robot is on its way over it; assumed: a stride
 ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
 
 Seen = TypeVar("Seen", bound=tuple)
@@ -60,6 +62,14 @@ def opened(run: Path | None, policy: Path | None, engine: EngineName) -> tuple[P
     source = exported.chosen(run, policy)
     world = runs.world_of(exported.read_config(source), engine)
     return exported.load(source, world)._replace(run=source), world
+
+
+def medium(c: Config) -> list[Atlas]:
+    """Return a lane of each kind at its medium size of Table II, or else the middle of training."""
+    whole = lanes.build(dataclasses.replace(c.terrain, name="mixed"))
+    middle = dict(zip(whole.kinds, np.mean(whole.sizes, axis=0), strict=True))
+    size = lambda kind: lanes.named_sizes(c.terrain, kind).get("medium", float(middle[kind]))
+    return [lanes.single(c.terrain, kind, size(kind)) for kind in whole.kinds]
 
 
 def placed(c: Config, world: World, atlases: Sequence[Atlas], command: float) -> World:
@@ -148,6 +158,34 @@ def _chunk(
         return (after, alive), Watched(alive, seen)
 
     return jax.lax.scan(step, carry, None, length=count)
+
+
+def terrain_under(atlas: Atlas, x: Float[np.ndarray, "T E"]) -> Shaped[np.ndarray, "T E"]:
+    """Return the kind of ground that each robot at `x`, m along its lane, walks on.
+
+    On a lane of stairs that is the direction of the flight, whichever comes first there. It is ""
+    on level ground more than BEFORE before an obstacle, and between obstacles' ends and the lane's.
+    """
+    names = np.full(x.shape, "", dtype="U16")
+    for k, kind in enumerate(atlas.kinds):
+        mine = (slice(None), np.arange(x.shape[1]) % len(atlas.kinds) == k)
+        names[mine] = _on_lane(atlas.tile(0, k), kind, x[mine])
+    return names
+
+
+def _on_lane(ground: Terrain, kind: str, x: Float[np.ndarray, "*n"]) -> Shaped[np.ndarray, "*n"]:
+    """Return the kind of ground of robots that are all on this lane."""
+    if kind.startswith("stairs"):
+        shape = profile.of_lane(ground)
+        way = profile.flight_at(shape, x)
+        way = np.where(way == 0, profile.flight_at(shape, x + BEFORE), way)
+        return np.array(["", "stairs up", "stairs down"])[way]
+    heights, _ = scene.window(ground)
+    uneven = ground.cell * np.flatnonzero(heights.any(axis=1))
+    if not uneven.size:
+        return np.full(x.shape, kind)
+    over = (x >= uneven[0] - BEFORE) & (x <= uneven[-1] + ground.cell)
+    return np.where(over, kind, "")
 
 
 def onsets(flag: Bool[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:

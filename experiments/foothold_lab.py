@@ -8,7 +8,7 @@ footholds_on_stairs.csv (a row a touchdown); some two minutes a policy on a CPU,
 Half the robots meet a flight up first, half a flight down: hard stairs, 20 cm rise, 30 cm tread.
 A touchdown is that of either foot on a tread, after at least AIR in the air, of a robot that has
 not failed. Its position is that of the sole's centre, from the tread's nosing (0) towards its riser
-(30 cm), on the way up as on the way down. The spread is the median absolute deviation.
+(30 cm), on the way up as on the way down. MAD is the median absolute deviation from the median.
 
 A riser collision begins when a contact sphere touches a riser that faces the robot, or its nosing:
 the surface nearest to the sphere is nearer than its radius, and its normal points back along the
@@ -37,7 +37,7 @@ import tyro
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, foothold, kinematics, lanes, profile, terrain, watch
+from cref_jax import cli, evaluation, exported, foothold, kinematics, lanes, profile, terrain, watch
 from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
@@ -46,9 +46,10 @@ from cref_jax.world import World
 KINDS = ("stairs_up", "stairs_down")
 AIR = 0.06  # s; assumed: three control steps, a shorter time is a foot that rocks
 REACH = 0.1  # m, half a sole
+TILT = 0.05  # m from a tread's height to the sole's centre, at most; assumed: tilted by 30 degrees
 FACING = -0.7  # x of a riser's normal, at most: within 45 degrees of -x
 BIN = 0.01  # m
-PAPER = {"ours": 1.4, "FCQR": 2.8, "NoFR": 9.8}  # cm, spread in descent, Sec. III-B
+PAPER = {"ours": 1.4, "FCQR": 2.8, "NoFR": 9.8}  # cm, MAD in descent, Sec. III-B
 WAYS = {profile.UP: "ascent", profile.DOWN: "descent"}
 COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm")
 
@@ -99,19 +100,32 @@ class Way(NamedTuple):
 
     robots: int  # on the lanes
     reached: int  # robots that came onto such a flight
+    crossed: int  # robots that came to the end of one
     robot: np.ndarray  # of each touchdown: its number
     foot: np.ndarray  # 0 left, 1 right
     time: np.ndarray  # s
     position: np.ndarray  # m
     foot_riser: int  # collisions
     shank_riser: int
+    collided: int  # robots that had one
 
     def line(self) -> str:
-        """Return the outcome in one line for people."""
+        """Return the touchdowns in one line for people."""
         n = len(self.position)
         spread = f", median {100 * np.median(self.position):.1f} cm" if n else ""
-        spread += f", spread {100 * deviation(self.position):.1f} cm" if n else ""
-        return f"{self.reached} of {self.robots} robots on the flight, {n} touchdowns{spread}"
+        spread += f", MAD {100 * deviation(self.position):.1f} cm" if n else ""
+        return f"{self.came()}, {n} touchdowns{spread}"
+
+    def came(self) -> str:
+        """Return how many robots came onto the flight, and how many over it."""
+        return f"{self.reached} of {self.robots} robots came here, {self.crossed} to its end"
+
+    def collisions(self) -> str:
+        """Return how often a riser was touched."""
+        return (
+            f"{self.collided} robots touched a riser: {self.foot_riser} times with a foot, "
+            f"{self.shank_riser} with a shank"
+        )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -120,36 +134,37 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(options.debug):
         cli.prepare()
         out = watch.picture(options.out)
-        found = {label: measured(*pair, options) for label, pair in named(options).items()}
+        found = {label: measured(path, options) for label, path in named(options).items()}
         for label, ways in found.items():
             for way, name in WAYS.items():
                 print(f"{label}, {name}: {ways[way].line()}")
-            print(f"{label}, {_collisions(ways[profile.UP])}")
+            print(f"{label}, ascent: {ways[profile.UP].collisions()}")
         watch.write_table(out.with_suffix(".csv"), COLUMNS, rows(found))
         draw(out, found, options)
         print(f"wrote {out} and {out.with_suffix('.csv')}")
 
 
-def named(options: Options) -> dict[str, tuple[Path | None, Path | None]]:
-    """Return run and policy of each label.
+def named(options: Options) -> dict[str, Path]:
+    """Return the policy or run of each label.
 
     Raises:
         ConfigError: a label is missing or there twice, or --policies are not all.
     """
     if not options.policies:
-        return {"policy": (options.run, options.policy)}
+        source = exported.chosen(options.run, options.policy)
+        return {source.stem: source}
     if options.run or options.policy:
         raise ConfigError("give --policies, or one --policy or --run")
     pairs = [text.partition("=") for text in options.policies]
     labels = [label for label, _, _ in pairs]
     if not all(label and path for label, _, path in pairs) or len(set(labels)) < len(labels):
         raise ConfigError(f"--policies are different LABEL=PATH, not {' '.join(options.policies)}")
-    return {label: (None, Path(path)) for label, _, path in pairs}
+    return {label: Path(path) for label, _, path in pairs}
 
 
-def measured(run: Path | None, path: Path | None, options: Options) -> dict[int, Way]:
+def measured(path: Path, options: Options) -> dict[int, Way]:
     """Return what one policy does on the flights up and on those down."""
-    policy, world = watch.opened(run, path, options.engine)
+    policy, world = watch.opened(None, path, options.engine)
     shape = {"tread": [options.tread]}
     stairs = [lanes.single(policy.config.terrain, k, options.rise, shape) for k in KINDS]
     world = watch.placed(policy.config, world, stairs, options.command)
@@ -197,26 +212,34 @@ def summed(world: World, watched: Watched[Step]) -> dict[int, Way]:
     t, robot, foot = np.nonzero(down)
     sole = seen.sole[t, robot, foot]
     flight, position = np.zeros(len(t), int), np.zeros(len(t))
-    over = np.zeros(alive.shape, int)
+    over, passed = np.zeros(alive.shape, int), {way: np.zeros(alive.shape, bool) for way in WAYS}
     for k, p in enumerate(profiles):
         mine = lane[robot] == k
-        place = profile.landed(p, sole[mine, 0], sole[mine, 2], REACH)
+        place = profile.landed(p, sole[mine, 0], sole[mine, 2], REACH, TILT)
         flight[mine], position[mine] = place.flight, place.position
-        over[:, lane == k] = profile.flight_at(p, seen.base_x[:, lane == k])
+        x = seen.base_x[:, lane == k]
+        over[:, lane == k] = profile.flight_at(p, x)
+        for way in WAYS:
+            passed[way][:, lane == k] = x > p.right[p.flight == way].max()
     period = world.config.physics.control_period
-    collided = lambda flag: int(watch.onsets(flag & alive[..., None]).sum())
+    foot_hits, shank_hits = (
+        watch.onsets(flag & alive[..., None]) for flag in (seen.foot_riser, seen.shank_riser)
+    )
+    robots = lambda flag: int((flag & alive).any(axis=0).sum())
     ways = {}
     for way in WAYS:
         mine = flight == way
         ways[way] = Way(
             robots=alive.shape[1],
-            reached=int(((over == way) & alive).any(axis=0).sum()),
+            reached=robots(over == way),
+            crossed=robots(passed[way]),
             robot=robot[mine],
             foot=foot[mine],
             time=(t[mine] + 1) * period,
             position=position[mine],
-            foot_riser=collided(seen.foot_riser) if way == profile.UP else 0,
-            shank_riser=collided(seen.shank_riser) if way == profile.UP else 0,
+            foot_riser=int(foot_hits.sum()) if way == profile.UP else 0,
+            shank_riser=int(shank_hits.sum()) if way == profile.UP else 0,
+            collided=robots((foot_hits | shank_hits).any(axis=2)) if way == profile.UP else 0,
         )
     return ways
 
@@ -236,7 +259,7 @@ def rows(found: dict[str, dict[int, Way]]) -> Iterator[tuple]:
 
 
 def draw(out: Path, found: dict[str, dict[int, Way]], options: Options) -> None:
-    """Draw a row of histograms a policy, and the spreads beside those of the paper."""
+    """Draw a row of histograms a policy, and the deviations beside those of the paper."""
     size = (11, 1.2 + 2.4 * len(found))
     figure = plt.figure(figsize=size, constrained_layout=True)
     grid = figure.add_gridspec(len(found), 3, width_ratios=(3, 3, 2))
@@ -246,11 +269,11 @@ def draw(out: Path, found: dict[str, dict[int, Way]], options: Options) -> None:
             histogram(axis, ways[way], 100 * options.tread, f"C{row}")
             axis.set_title(f"{label}, {name}", fontsize=10)
             if row == len(found) - 1:
-                axis.set_xlabel("sole's centre from the nosing, cm (dashed: nosing, riser)")
-    spreads(figure.add_subplot(grid[:, 2]), found)
+                axis.set_xlabel("from nosing (0) towards riser, cm")
+    deviations(figure.add_subplot(grid[:, 2]), found)
     figure.suptitle(
-        f"Touchdowns on stairs, rise {100 * options.rise:g} cm, tread {100 * options.tread:g} cm, "
-        f"both feet, {options.command:g} m/s",
+        f"Where the sole's centre comes down, both feet: rise {100 * options.rise:g} cm, "
+        f"tread {100 * options.tread:g} cm, {options.command:g} m/s",
         fontsize=11,
     )
     figure.savefig(out, dpi=90)
@@ -262,40 +285,37 @@ def histogram(axis: Axes, way: Way, tread: float, colour: str) -> None:
     for x in (0.0, tread):
         axis.axvline(x, color="0.5", lw=0.8, ls="--")
     axis.set(xlim=(edges[0], edges[-1]), ylabel="share of touchdowns")
-    said = [f"{way.reached} of {way.robots} robots came here"]
+    said = [way.came()]
     if len(way.position):
         weights = np.full(len(way.position), 1.0 / len(way.position))
         axis.hist(100 * way.position, edges, weights=weights, color=colour, alpha=0.8)
         said += [
             f"{len(way.position)} touchdowns",
-            f"spread {100 * deviation(way.position):.1f} cm",
+            f"MAD {100 * deviation(way.position):.1f} cm",
         ]
     else:
         axis.set(yticks=[], ylim=(0, 1))
         said += ["no touchdown on a tread"]
-    if way.foot_riser or way.shank_riser:
-        said += [f"riser touched: foot {way.foot_riser}, shank {way.shank_riser}"]
+    if way.collided:
+        said += way.collisions().split(": ")
     axis.set_ylim(top=1.7 * axis.get_ylim()[1] if len(way.position) else 1.0)
     axis.text(0.98, 0.96, "\n".join(said), transform=axis.transAxes, ha="right", va="top", size=8)
 
 
-def spreads(axis: Axes, found: dict[str, dict[int, Way]]) -> None:
-    """Draw the spread in descent of each policy, under those that the paper gives."""
-    bars = [(f"paper: {name}", value, "0.7") for name, value in PAPER.items()]
+def deviations(axis: Axes, found: dict[str, dict[int, Way]]) -> None:
+    """Draw the deviation in descent of each policy, under those that the paper gives."""
+    bars = [(f"paper: {name}", value, "", "0.7") for name, value in PAPER.items()]
     for row, (label, ways) in enumerate(found.items()):
         x = ways[profile.DOWN].position
-        bars.append((label, 100 * deviation(x) if len(x) else np.nan, f"C{row}"))
-    for y, (_, value, colour) in enumerate(bars):
-        axis.barh(y, 0.0 if np.isnan(value) else value, color=colour)
-        said = "no touchdown" if np.isnan(value) else f"{value:.1f}"
-        axis.text((0.0 if np.isnan(value) else value) + 0.15, y, said, va="center", size=8)
-    axis.set_yticks(range(len(bars)), [label for label, _, _ in bars])
-    axis.set(xlabel="spread in descent, cm (MAD)", xlim=(0, 12))
+        value = 100 * deviation(x) if len(x) else 0.0
+        bars.append((label, value, f", n = {len(x)}" if len(x) else "none", f"C{row}"))
+    for y, (_, value, note, colour) in enumerate(bars):
+        axis.barh(y, value, color=colour)
+        said = f"{value:.1f}" * (note != "none") + note
+        axis.text(value + 0.15, y, said, va="center", size=8)
+    axis.set_yticks(range(len(bars)), [label for label, *_ in bars])
+    axis.set(xlabel="MAD in descent, cm", xlim=(0, 1.4 * max(value for _, value, *_ in bars)))
     axis.invert_yaxis()
-
-
-def _collisions(ascent: Way) -> str:
-    return f"ascent: {ascent.foot_riser} foot-riser and {ascent.shank_riser} shank-riser collisions"
 
 
 if __name__ == "__main__":
