@@ -20,7 +20,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 from rich.progress import Progress
 
-from cref_jax import evaluation, exported, lanes, network, ppo, profile, rollout, runs, scene
+from cref_jax import (
+    config,
+    evaluation,
+    exported,
+    lanes,
+    network,
+    ppo,
+    profile,
+    rollout,
+    runs,
+    scene,
+)
 from cref_jax.config import Config, ConfigError
 from cref_jax.env import Outcome
 from cref_jax.lanes import Atlas
@@ -70,6 +81,19 @@ def medium(c: Config) -> list[Atlas]:
     middle = dict(zip(whole.kinds, np.mean(whole.sizes, axis=0), strict=True))
     size = lambda kind: lanes.named_sizes(c.terrain, kind).get("medium", float(middle[kind]))
     return [lanes.single(c.terrain, kind, size(kind)) for kind in whole.kinds]
+
+
+def kind_of_lane(c: Config, asked: str | None) -> str:
+    """Return the kind of lane to follow one robot on: the one asked for, or the policy's own.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
+    kinds = lanes.build(dataclasses.replace(c.terrain, name="mixed")).kinds
+    if asked is not None and asked not in kinds:
+        raise ConfigError(config.unknown("kind", asked, list(kinds)))
+    own = [kind for kind in lanes.build(c.terrain).kinds if kind in kinds and kind != "flat"]
+    return asked or ("stairs_up" if "stairs_up" in own or not own else own[0])
 
 
 def placed(c: Config, world: World, atlases: Sequence[Atlas], command: float) -> World:
@@ -160,31 +184,35 @@ def _chunk(
     return jax.lax.scan(step, carry, None, length=count)
 
 
-def terrain_under(atlas: Atlas, x: Float[np.ndarray, "T E"]) -> Shaped[np.ndarray, "T E"]:
+def terrain_under(
+    atlas: Atlas, x: Float[np.ndarray, "T E"], before: float = BEFORE
+) -> Shaped[np.ndarray, "T E"]:
     """Return the kind of ground that each robot at `x`, m along its lane, walks on.
 
     On a lane of stairs that is the direction of the flight, whichever comes first there. It is ""
-    on level ground more than BEFORE before an obstacle, and between obstacles' ends and the lane's.
+    on level ground more than `before` m before an obstacle, and between obstacles' ends and the lane's.
     """
     names = np.full(x.shape, "", dtype="U16")
     for k, kind in enumerate(atlas.kinds):
         mine = (slice(None), np.arange(x.shape[1]) % len(atlas.kinds) == k)
-        names[mine] = _on_lane(atlas.tile(0, k), kind, x[mine])
+        names[mine] = _on_lane(atlas.tile(0, k), kind, x[mine], before)
     return names
 
 
-def _on_lane(ground: Terrain, kind: str, x: Float[np.ndarray, "*n"]) -> Shaped[np.ndarray, "*n"]:
+def _on_lane(
+    ground: Terrain, kind: str, x: Float[np.ndarray, "*n"], before: float
+) -> Shaped[np.ndarray, "*n"]:
     """Return the kind of ground of robots that are all on this lane."""
     if kind.startswith("stairs"):
         shape = profile.of_lane(ground)
         way = profile.flight_at(shape, x)
-        way = np.where(way == 0, profile.flight_at(shape, x + BEFORE), way)
+        way = np.where(way == 0, profile.flight_at(shape, x + before), way)
         return np.array(["", "stairs up", "stairs down"])[way]
     heights, _ = scene.window(ground)
     uneven = ground.cell * np.flatnonzero(heights.any(axis=1))
     if not uneven.size:
         return np.full(x.shape, kind)
-    over = (x >= uneven[0] - BEFORE) & (x <= uneven[-1] + ground.cell)
+    over = (x >= uneven[0] - before) & (x <= uneven[-1] + ground.cell)
     return np.where(over, kind, "")
 
 

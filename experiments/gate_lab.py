@@ -15,7 +15,6 @@ The paper finds higher gates on stairs than on flat ground, in flight than in su
 than in stable postures. n counts robots' steps of 20 ms, which are far from independent.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, lanes, profile, watch
+from cref_jax import cli, evaluation, profile, watch
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
@@ -109,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
         policy, world = watch.opened(options.run, options.policy, options.engine)
         c = policy.config
         check(c)
-        kind = traced_kind(c, options.kind)
+        kind = watch.kind_of_lane(c, options.kind)
         world = watch.placed(c, world, watch.medium(c), options.command)
         robots = evaluation.starts(
             world, options.seed, watch.crowd(options.num_envs, on_accelerator=4096)
@@ -136,19 +135,6 @@ def check(c: Config) -> None:
         raise ConfigError("this policy has no gate: its variant is 'no_highway'; take any other")
     if c.network.variant == "blind":
         print("a blind policy: its gate blends memory with proprioception, no depth")
-
-
-def traced_kind(c: Config, asked: str | None) -> str:
-    """Return the kind of lane to trace a robot on: the one asked for, or the policy's own.
-
-    Raises:
-        ConfigError: there is no such kind.
-    """
-    kinds = lanes.build(dataclasses.replace(c.terrain, name="mixed")).kinds
-    if asked is not None and asked not in kinds:
-        raise ConfigError(f"unknown kind '{asked}'; known: {', '.join(kinds)}")
-    own = [k for k in lanes.build(c.terrain).kinds if k in kinds and k != "flat"]
-    return asked or ("stairs_up" if "stairs_up" in own or not own else own[0])
 
 
 def look(world: World, moment: Moment) -> Step:
