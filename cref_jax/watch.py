@@ -190,7 +190,7 @@ def terrain_under(
     """Return the kind of ground that each robot at `x`, m along its lane, walks on.
 
     On a lane of stairs that is the direction of the flight, whichever comes first there. It is ""
-    on level ground more than `before` m before an obstacle, and between obstacles' ends and the lane's.
+    on the level ground of other lanes, but for the last `before` m before an obstacle.
     """
     names = np.full(x.shape, "", dtype="U16")
     for k, kind in enumerate(atlas.kinds):

@@ -1,19 +1,22 @@
 """What the query looks at: `python experiments/attention_lab.py`.
 
 Writes attention.png and attention.csv: the weights that the cross attention of Eq. 10 gives the
-depth tokens, over the depth image while one robot comes to an edge, steps over it and goes on; their
-mean on each terrain; and how much of them lies where there is something to see. Some three minutes
-on a CPU, with 64 robots.
+depth tokens, over the depth image while one robot comes to an edge, steps over it and goes on;
+their mean on each terrain; and how much of them lies where there is something to see. Some three
+minutes on a CPU, with 64 robots.
 
-A token stands for the block of pixels that lies under it (8 x 8). It has a ground edge where a pixel
-of it lies more than 3 cm off the plane through its two neighbours in its row or column, links of the
-robot apart: a jump or a crease of the ground. It has own links where a leg or an arm is in view.
+A token stands for the block of pixels that lies under it (8 x 8). It has a ground edge where a
+pixel of it lies more than 3 cm off the plane through its two neighbours in its row or column, links
+of the robot apart: a jump or a crease of the ground. It has own links where a leg or an arm is in
+view.
 
-Enrichment is the share of the attention on such tokens over their share of all tokens, frame by
-frame: 1 if the query looks anywhere, N / n if it looks at these n of N tokens alone. Beside it stands
-what the policy's mean map of that terrain would have, which never moves: only what is above it shows
-that the query follows the scene. Frames without such a token, or with nothing else, do not count. A
-row of tokens has the distance at which it meets level ground, from the pelvis of the standing robot.
+Enrichment is the share of the attention, mean of the heads, on such tokens over their share of all
+tokens: 1 if the query looks anywhere, N / n if it looks at these n of N tokens alone. Beside it
+stands what the policy's mean map of that terrain would have, which never moves: only what is above
+it shows that the query follows the scene. Frames without such a token, or with nothing else, do not
+count. A terrain begins 1.5 m before its first obstacle. A row of tokens has the distance at which
+it meets level ground, from the pelvis of the standing robot. Frames come 20 times a second and are
+far from independent.
 """
 
 import functools
@@ -34,9 +37,8 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from cref_jax import cli, depth, evaluation, kinematics, network, profile, watch
-from cref_jax.config import Camera, Config, ConfigError
-from cref_jax.episode import EnvState
+from cref_jax import cli, evaluation, gaze, profile, watch
+from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
@@ -44,7 +46,6 @@ from cref_jax.world import World
 EDGE = (
     0.03  # m off the plane of the neighbours; assumed: above rounding and the slope's 2 cm columns
 )
-LINK = 0.02  # m nearer than the ground; assumed: above the rounding of 16 bits
 AHEAD = 1.5  # m before an obstacle from where it counts as such; most of what the camera sees
 MOMENTS = (-0.9, -0.5, -0.2, 0.1, 0.5)  # m from the edge to the pelvis
 FOLLOWED = 8  # robots whose images are kept, to choose one of
@@ -92,7 +93,7 @@ class Step(NamedTuple):
     base_x: Float[Array, " E"]  # m, when it is
     edge: Bool[Array, "E N"]  # tokens of that frame
     own: Bool[Array, "E N"]
-    frame: Float16[Array, "E H W"] | Float16[Array, "1 H W"]  # of the robots followed, the rest 0
+    frame: Float16[Array, "R H W"]  # D, of the R robots that are followed
     attention: Float[Array, "E heads N"]  # to the frame before
 
 
@@ -128,26 +129,24 @@ def main(arguments: list[str] | None = None) -> None:
         check(c)
         kind = watch.kind_of_lane(c, options.kind)
         world = watch.placed(c, world, watch.medium(c), options.command)
-        robots = evaluation.starts(
-            world, options.seed, watch.crowd(options.num_envs, on_accelerator=512)
-        )
-        ours = np.arange(robots.begins.size) % len(world.lanes.kinds)
-        followed = np.flatnonzero(ours == world.lanes.kinds.index(kind))[:FOLLOWED]
+        count = watch.crowd(options.num_envs, on_accelerator=512)
+        robots = evaluation.starts(world, options.seed, count)
+        of_kind = np.arange(count) % len(world.lanes.kinds) == world.lanes.kinds.index(kind)
+        followed = np.flatnonzero(of_kind)[:FOLLOWED]
         if not followed.size:
             raise ConfigError(f"--num-envs must be at least {len(world.lanes.kinds)}: one a lane")
         steps = watch.steps_of(options.seconds, c)
-        watched = watch.watch(
-            world, policy.train, robots, steps, functools.partial(look, tuple(followed))
-        )
+        seeing = functools.partial(look, tuple(followed))
+        watched = watch.watch(world, policy.train, robots, steps, seeing)
         frames = attended(watched)
         terrain = watch.terrain_under(world.lanes, watched.seen.base_x, AHEAD)
         of_frame = terrain[frames.step, frames.robot]
-        found = list(rows(frames, of_frame, ahead(world), grid(c)))
+        found = list(rows(frames, of_frame, gaze.ahead(world), gaze.grid(c)))
         watch.write_table(out.with_suffix(".csv"), COLUMNS, found)
         for row in found:
             if row.where in TARGETS:
                 print(line(row))
-        figure = plt.figure(figsize=(13.5, 6.4), constrained_layout=True)
+        figure = plt.figure(figsize=(13.5, 7.0), constrained_layout=True)
         left, right = figure.subfigures(1, 2, width_ratios=(1.15, 1.0))
         strip(left, world, watched, frames, followed, kind)
         maps_and_bars(right, frames, of_frame, found, world)
@@ -167,25 +166,18 @@ def check(c: Config) -> None:
         )
 
 
-def grid(c: Config) -> tuple[int, int]:
-    """Return the rows and columns of the tokens."""
-    tokens = network.no_features(c.network, c.camera.shape, 1).tokens.shape[2]
-    rows = round((tokens * c.camera.shape[0] / c.camera.shape[1]) ** 0.5)
-    return rows, tokens // rows
-
-
 def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
     """Return the frame that is exposed, what is in it, and the attention to the one before."""
     state, feed = moment.robots.env, moment.after.feed
-    shape = grid(world.config)
+    shape = gaze.grid(world.config)
 
     def targets() -> tuple[Bool[Array, "E N"], Bool[Array, "E N"]]:
         camera = world.config.camera
         metres = (feed.frame.astype(jnp.float32) + 0.5) * camera.d_max
-        ground = jax.vmap(lambda s: ground_alone(world, s))(state)
-        own = metres < ground - LINK
-        edge = is_edge(ground, camera) & ~own
-        return in_tokens(edge, shape), in_tokens(own, shape)
+        ground = jax.vmap(lambda s: gaze.ground_alone(world, s))(state)
+        own = metres < ground - gaze.LINK
+        edge = gaze.is_edge(ground, camera) & ~own
+        return gaze.in_tokens(edge, shape), gaze.in_tokens(own, shape)
 
     none = jnp.zeros((state.step.size, shape[0] * shape[1]), bool)
     edge, own = jax.lax.cond(feed.fresh, targets, lambda: (none, none))
@@ -197,45 +189,6 @@ def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
         frame=feed.frame[np.array(followed)],
         attention=moment.policy.attention[0],
     )
-
-
-def ground_alone(world: World, state: EnvState) -> Float[Array, "H W"]:
-    """Return one robot's depth image without its own links, m."""
-    robot, camera = world.physics.robot, world.config.camera
-    links = world.physics.links(state.body)
-    position, rotation = depth.pose(
-        links, robot.camera, camera, state.camera_pitch, state.camera_shift
-    )
-    ground = world.lanes.tile(state.level, state.kind)
-    return depth.render(ground, position, rotation, jnp.zeros((0, 7)), camera)
-
-
-def is_edge(metres: Float[Array, "*n H W"], camera: Camera) -> Bool[Array, "*n H W"]:
-    """Return which pixels lie more than EDGE off the plane of their neighbours, up-down or across.
-
-    On a plane 1 / depth is linear over the image. What is beyond d_max reads d_max: where a plane
-    only leaves the range, one side of a pixel foretells the other, and it is no edge.
-    """
-    least = 1.0 / camera.d_max
-    w = 1.0 / jnp.maximum(metres, 1e-3)
-
-    def off(axis: int) -> Float[Array, "*n H W"]:
-        a, b, c = (jnp.roll(w, shift, axis) for shift in (1, 0, -1))
-        ahead = jnp.abs(jnp.maximum(2.0 * b - a, least) - c)
-        back = jnp.abs(jnp.maximum(2.0 * b - c, least) - a)
-        inner = np.zeros(w.shape[axis], bool)
-        inner[1:-1] = True
-        inner = jnp.asarray(inner).reshape((-1, 1) if axis == -2 else (1, -1))
-        return jnp.where(inner & (b > least * 1.001), jnp.minimum(ahead, back) / (b * b), 0.0)
-
-    return jnp.maximum(off(-2), off(-1)) > EDGE
-
-
-def in_tokens(pixels: Bool[Array, "*n H W"], shape: tuple[int, int]) -> Bool[Array, "*n N"]:
-    """Return which tokens have such a pixel, row by row from the top left."""
-    *lead, height, width = pixels.shape
-    blocks = pixels.reshape(*lead, shape[0], height // shape[0], shape[1], width // shape[1])
-    return blocks.any(axis=(-3, -1)).reshape(*lead, -1)
 
 
 def attended(watched: Watched[Step]) -> Frames:
@@ -263,48 +216,14 @@ def rows(
             counts = tokens[there].any(axis=1) & ~tokens[there].all(axis=1)
             n, chosen = int(counts.sum()), tokens[there][counts]
             if n:
-                share, got = shares(mean[there][counts], chosen)
-                _, still = shares(np.broadcast_to(fixed, chosen.shape), chosen)
+                share, got = gaze.shares(mean[there][counts], chosen)
+                _, still = gaze.shares(np.broadcast_to(fixed, chosen.shape), chosen)
                 yield Row(name, where, n, share, got, got / share, still / share)
         by_row = fixed.reshape(shape).sum(axis=1)
         for k, got in enumerate(by_row):
             where, n = f"row {k}, {distances[k]:.2f} m ahead", int(there.sum())
             rich = float(got) * shape[0]
             yield Row(name, where, n, 1.0 / shape[0], float(got), rich, rich)
-
-
-def shares(
-    attention: Float[np.ndarray, "F N"], tokens: Bool[np.ndarray, "F N"]
-) -> tuple[float, float]:
-    """Return the share of the tokens, and that of the attention on them; means over the frames."""
-    return float(tokens.mean()), float((attention * tokens).sum(axis=1).mean())
-
-
-def upsampled(
-    weights: Float[np.ndarray, " N"], shape: tuple[int, int], image: tuple[int, int]
-) -> Float[np.ndarray, "H W"]:
-    """Return each token's weight spread evenly over its pixels: the sum stays."""
-    block = (image[0] // shape[0], image[1] // shape[1])
-    return np.kron(weights.reshape(shape), np.ones(block)) / (block[0] * block[1])
-
-
-def ahead(world: World) -> Float[np.ndarray, " rows"]:
-    """Return where the middle of each row of tokens meets level ground, m before the pelvis.
-
-    The robot stands at its nominal pose.
-    """
-    robot, camera = world.physics.robot, world.config.camera
-    base = [0.0, 0.0, robot.standing_height, 1.0, 0.0, 0.0, 0.0]
-    qpos = jnp.concatenate([jnp.array(base), jnp.asarray(robot.nominal_pose)])
-    links = kinematics.links(world.physics.tree, qpos, jnp.zeros(qpos.size - 1))
-    position, axes = depth.pose(links, robot.camera, camera, 0.0, jnp.zeros(3))
-    count, _ = grid(world.config)
-    slope = np.tan(np.deg2rad(0.5 * camera.view[0])) * (
-        2.0 * (np.arange(count) + 0.5) / count - 1.0
-    )
-    rays = np.asarray(axes) @ np.stack([np.zeros(count), slope, np.ones(count)])
-    at, eye = -float(position[2]) / rays[2], float(position[0])
-    return np.where(at > 0.0, eye + at * rays[0], np.inf)
 
 
 def line(row: Row) -> str:
@@ -334,7 +253,10 @@ def strip(
     heads = frames.attention.shape[1]
     axes = figure.subplots(2 + heads, len(MOMENTS), squeeze=False)
     figure.suptitle(
-        f"one robot on {kind}; x: from the lane's first edge to its pelvis", fontsize=10
+        f"one robot on {kind}, {100 * float(world.lanes.sizes[0, k]):.0f} cm; "
+        "x: from the lane's first edge to its pelvis\n"
+        "orange: attention, each map up to its own largest; blue: tokens with a ground edge",
+        fontsize=9,
     )
     if not mine.size:
         return
@@ -347,7 +269,9 @@ def strip(
         axes[0, column].set_title(f"x = {there:+.2f} m", fontsize=9)
         weights = frames.attention[at]
         for row, given in enumerate([weights.mean(axis=0), *weights], start=1):
-            overlay(axes[row, column], image, upsampled(given, grid(c), c.camera.shape))
+            edges = frames.targets["ground edge"][at]
+            given, edges = (gaze.upsampled(x, gaze.grid(c), c.camera.shape) for x in (given, edges))
+            overlay(axes[row, column], image, given, edges)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
     names = [
@@ -359,10 +283,19 @@ def strip(
         axis.set_ylabel(name, fontsize=8)
 
 
-def overlay(axis: Axes, image: Float[np.ndarray, "H W"], weights: Float[np.ndarray, "H W"]) -> None:
-    """Draw attention, brightest at its largest, over the outlines of the depth image."""
-    axis.imshow(weights, cmap="magma", vmin=0.0)
-    axis.contour(image, levels=np.linspace(-0.45, 0.45, 10), colors="w", linewidths=0.4, alpha=0.6)
+def overlay(
+    axis: Axes,
+    image: Float[np.ndarray, "H W"],
+    weights: Float[np.ndarray, "H W"],
+    edges: Float[np.ndarray, "H W"],
+) -> None:
+    """Draw attention over the depth image, and the outline of the tokens with an edge."""
+    axis.imshow(image, cmap="gray_r", vmin=-0.7, vmax=0.5)
+    paint = np.ones((*image.shape, 4)) * matplotlib.colors.to_rgba("darkorange")
+    paint[..., 3] = weights / weights.max()
+    axis.imshow(paint)
+    if 0.0 < edges.max() != edges.min():
+        axis.contour(edges, levels=[0.5 * edges.max()], colors="tab:blue", linewidths=0.8)
 
 
 def maps_and_bars(
@@ -370,23 +303,25 @@ def maps_and_bars(
 ) -> None:
     """Draw the mean attention on each terrain, and how much of it is on edges and links."""
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.0))
-    shape, distances = grid(world.config), ahead(world)
+    shape, distances = gaze.grid(world.config), gaze.ahead(world)
     mean = frames.attention.mean(axis=1)
     axes = above.subplots(2, 4)
-    above.suptitle("mean attention by terrain, times even; rows: m ahead", fontsize=10)
+    above.suptitle("mean attention by terrain", fontsize=10)
     image = None
     for axis, name in zip(axes.flat, TERRAINS, strict=False):
         there = terrain == name
-        axis.set_title(f"{name}, {there.sum():,} frames", fontsize=7)
+        axis.set_title(f"{name}\n{there.sum():,} frames", fontsize=8)
         axis.set(xticks=[], yticks=[])
         if there.any():
             share = mean[there].mean(axis=0).reshape(shape) * mean.shape[1]
             image = axis.imshow(share, cmap="magma", vmin=0.0, vmax=3.0)
     for axis in axes[:, 0]:
-        axis.set_yticks(range(shape[0]), [f"{x:.1f}" for x in distances], fontsize=6)
+        axis.set_yticks(range(shape[0]), [f"{x:.1f}" for x in distances], fontsize=7)
+        axis.set_ylabel("row meets level\nground, m ahead", fontsize=7)
     axes.flat[-1].set_axis_off()
     if image is not None:
-        above.colorbar(image, ax=axes.flat[-1], fraction=0.4, extend="max", location="left")
+        bar = above.colorbar(image, ax=axes, extend="max", fraction=0.03)
+        bar.set_label("times an even share", fontsize=8)
     bars(below, found)
 
 

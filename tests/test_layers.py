@@ -19,7 +19,7 @@ LAYERS = [
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
-    {"rollout", "checkpoint", "distill", "brax_env"},
+    {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"runs", "peers", "stand_in"},
     {"exported"},
