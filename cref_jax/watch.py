@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,6 @@ CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
 BEFORE = 0.5  # m before an obstacle from where a robot is on its way over it; assumed: a stride
 ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
 
-Seen = TypeVar("Seen", bound=tuple)
-
 
 class Moment(NamedTuple):
     """One control step of E robots."""
@@ -56,11 +54,11 @@ class Moment(NamedTuple):
     after: rollout.Robots  # a robot that has come to its end stands at its next start
 
 
-class Watched(NamedTuple, Generic[Seen]):
+class Watched(NamedTuple):
     """What was looked at during T steps of E robots."""
 
     alive: Bool[np.ndarray, "T E"]  # no end has come, neither before this step nor by it
-    seen: Seen  # arrays [T, E, ...], of which only those of `alive` count
+    seen: Any  # what was kept of each step, arrays [T, ...]; only those of `alive` count
 
 
 def opened(run: Path | None, policy: Path | None, engine: EngineName) -> tuple[Policy, World]:
@@ -141,14 +139,14 @@ def watch(
     train: ppo.TrainState,
     robots: rollout.Robots,
     steps: int,
-    look: Callable[[World, Moment], Seen],
-) -> Watched[Seen]:
+    look: Callable[[World, Moment], Any],
+) -> Watched:
     """Let the policy's mean action walk the robots, and return what `look` saw of each step.
 
     It is over after `steps`, or a second after the last robot's end.
     """
     alive = jnp.ones(robots.begins.shape, bool)
-    parts: list[Watched[Seen]] = []
+    parts: list[Watched] = []
     with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
         task = bar.add_task("walking", total=steps)
         while steps > 0 and alive.any():

@@ -191,7 +191,7 @@ def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
     )
 
 
-def attended(watched: Watched[Step]) -> Frames:
+def attended(watched: Watched) -> Frames:
     """Return the frames of robots that lived on, with the attention of the step after."""
     seen = watched.seen
     t, robot = np.nonzero(seen.exposed[:-1] & watched.alive[1:])
@@ -238,7 +238,7 @@ def line(row: Row) -> str:
 def strip(
     figure: SubFigure,
     world: World,
-    watched: Watched[Step],
+    watched: Watched,
     frames: Frames,
     followed: Int[np.ndarray, " n"],
     kind: str,
@@ -269,7 +269,7 @@ def strip(
         axes[0, column].set_title(f"x = {there:+.2f} m", fontsize=9)
         weights = frames.attention[at]
         for row, given in enumerate([weights.mean(axis=0), *weights], start=1):
-            edges = frames.targets["ground edge"][at]
+            edges = frames.targets["ground edge"][at].astype(np.float32)
             given, edges = (gaze.upsampled(x, gaze.grid(c), c.camera.shape) for x in (given, edges))
             overlay(axes[row, column], image, given, edges)
     for axis in axes.flat:
@@ -338,6 +338,7 @@ def bars(figure: Figure | SubFigure, found: list[Row]) -> None:
     axis.axhline(1.0, color="0.5", lw=0.8, ls="--")
     axis.plot([], [], color="k", lw=1.5, label="the same of the mean map")
     axis.set_xticks(range(len(TERRAINS)), TERRAINS, fontsize=8)
+    axis.set_xlim(-0.6, len(TERRAINS) - 0.4)
     axis.set_ylabel("share of attention\nover share of tokens", fontsize=8)
     axis.set_ylim(top=1.25 * axis.get_ylim()[1])
     axis.legend(fontsize=7, loc="upper right", ncols=3)

@@ -203,7 +203,7 @@ def _feet(world: World, state) -> tuple[Float[Array, "F 3"], Bool[Array, " S"]]:
     return foothold.soles(links, robot).centre, hits
 
 
-def summed(world: World, watched: Watched[Step]) -> dict[int, Way]:
+def summed(world: World, watched: Watched) -> dict[int, Way]:
     """Return what was seen on the flights of each direction, robots on both lanes together."""
     alive, seen = watched.alive, watched.seen
     lane = np.arange(alive.shape[1]) % len(world.lanes.kinds)

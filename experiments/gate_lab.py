@@ -148,7 +148,7 @@ def look(world: World, moment: Moment) -> Step:
     )
 
 
-def rows(world: World, watched: Watched[Step]) -> Iterator[Row]:
+def rows(world: World, watched: Watched) -> Iterator[Row]:
     """Yield the gate in each state of each group."""
     seen = watched.seen
     counted = watched.alive.copy()
@@ -195,7 +195,7 @@ def line(row: Row) -> str:
     return said + (f" ({row.note})" if row.note else "")
 
 
-def draw(out: Path, found: list[Row], world: World, watched: Watched[Step], kind: str) -> None:
+def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str) -> None:
     """Draw the groups, and one robot's gate over the ground that it walked on."""
     figure = plt.figure(figsize=(12, 5), constrained_layout=True)
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.5), height_ratios=(4.0, 0.7, 2.0))
@@ -221,7 +221,7 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched[Step], kind
     figure.savefig(out, dpi=90)
 
 
-def furthest(world: World, watched: Watched[Step], kind: int) -> tuple[Int[np.ndarray, " t"], int]:
+def furthest(world: World, watched: Watched, kind: int) -> tuple[Int[np.ndarray, " t"], int]:
     """Return the steps and the number of the robot that came furthest on a lane."""
     x = np.where(watched.alive, watched.seen.pose[..., 0], -np.inf)
     x[:, np.arange(x.shape[1]) % len(world.lanes.kinds) != kind] = -np.inf
