@@ -109,6 +109,12 @@ def placed(c: Config, world: World, atlases: Sequence[Atlas], command: float) ->
     )
 
 
+def name_of_lane(world: World, kind: str) -> str:
+    """Return the kind of a lane and the size of its obstacles, for people."""
+    size = 100 * float(world.lanes.sizes[0, world.lanes.kinds.index(kind)])
+    return f"{kind}, {size:.0f} {'%' if kind == 'slope' else 'cm'}" if size else kind
+
+
 def crowd(asked: int | None, on_accelerator: int) -> int:
     """Return how many robots to watch: as many as asked for, or as the device does in a minute.
 

@@ -2,8 +2,8 @@
 
 Writes gate.png and gate.csv: the highway gate beta of Eq. 16, its mean over the channels, grouped
 by what the robot walks on, by how its feet touch the ground, and by its posture; and one robot's
-gate over time. Near 1 the action leans on memory, near 0 on what is sensed now. Some two minutes on
-a CPU, with 64 robots.
+gate over time. Near 1 the action leans on memory, near 0 on what is sensed now. 140 robots take two
+minutes on 4 busy cores, 40 s of which are compilation.
 
 Robots walk lanes of every kind at their medium size (Table II) at one command. Terrain: the lane of
 that name, from 0.5 m before its first obstacle to the end of its last; a flight of stairs counts by
@@ -213,9 +213,8 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
             gate.axvline(at, color="0.8", lw=0.8, zorder=0)
         for axis in (gate, feet):
             axis.tick_params(labelbottom=False)
-        size = 100 * float(world.lanes.sizes[0, k])
-        what = f"{kind}, {size:.0f} " + ("%" if kind == "slope" else "cm")
-        gate.set_title(f"{what}: the robot that came furthest", fontsize=9)
+        lane = watch.name_of_lane(world, kind)
+        gate.set_title(f"{lane}: the robot that came furthest", fontsize=9)
     else:
         gate.set_title(f"no robot on {kind}", fontsize=9)
     figure.savefig(out, dpi=90)
