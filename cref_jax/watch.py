@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from rich.progress import Progress
 
 from cref_jax import (
@@ -31,6 +31,7 @@ from cref_jax import (
     rollout,
     runs,
     scene,
+    trials,
 )
 from cref_jax.config import Config, ConfigError
 from cref_jax.env import Outcome
@@ -38,9 +39,10 @@ from cref_jax.lanes import Atlas
 from cref_jax.physics import EngineName
 from cref_jax.runs import Policy
 from cref_jax.terrain import Terrain
-from cref_jax.world import World
+from cref_jax.world import World, make_world
 
 CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
+STAIRS = ("stairs_up", "stairs_down", "ascent", "descent")
 BEFORE = 0.5  # m before an obstacle from where a robot is on its way over it; assumed: a stride
 ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
 
@@ -73,12 +75,15 @@ def opened(run: Path | None, policy: Path | None, engine: EngineName) -> tuple[P
     return exported.load(source, world)._replace(run=source), world
 
 
-def medium(c: Config) -> list[Atlas]:
-    """Return a lane of each kind at its medium size of Table II, or else the middle of training."""
+def medium(c: Config) -> Atlas:
+    """Return lanes of each kind at its medium size of Table II, or else the middle of training."""
     whole = lanes.build(dataclasses.replace(c.terrain, name="mixed"))
-    middle = dict(zip(whole.kinds, np.mean(whole.sizes, axis=0), strict=True))
-    size = lambda kind: lanes.named_sizes(c.terrain, kind).get("medium", float(middle[kind]))
-    return [lanes.single(c.terrain, kind, size(kind)) for kind in whole.kinds]
+    middle = np.mean(whole.sizes, axis=0).tolist()
+    sizes = {
+        kind: (lanes.named_sizes(c.terrain, kind).get("medium", size),)
+        for kind, size in zip(whole.kinds, middle, strict=True)
+    }
+    return lanes.grid(c.terrain, sizes, evaluation.LANE_SEEDS)
 
 
 def kind_of_lane(c: Config, asked: str | None) -> str:
@@ -94,19 +99,30 @@ def kind_of_lane(c: Config, asked: str | None) -> str:
     return asked or ("stairs_up" if "stairs_up" in own or not own else own[0])
 
 
-def placed(c: Config, world: World, atlases: Sequence[Atlas], command: float) -> World:
-    """Return the world with these lanes side by side, to be walked at `command`, m/s forward.
+def placed(c: Config, world: World, atlas: Atlas, command: float) -> World:
+    """Return the world of trials on these lanes, to be walked at `command`, m/s forward.
 
     Raises:
         ConfigError: the command is not above zero.
     """
     if not 0.0 < command < math.inf:
         raise ConfigError(f"--command must be above 0 m/s, not {command:g}")
-    judged = evaluation.crossing_world(c, world.physics, "flat", 0.0)
-    ask = dataclasses.replace(judged.config.command, lane_vx=(command, command))
-    return judged.replace(
-        config=dataclasses.replace(judged.config, command=ask), lanes=lanes.beside(atlases)
+    trial = evaluation.trial_config(c)
+    trial = dataclasses.replace(
+        trial, command=dataclasses.replace(trial.command, lane_vx=(command, command))
     )
+    return make_world(trial, world.physics).replace(lanes=atlas)
+
+
+def in_turn(atlas: Atlas, count: int) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
+    """Return kind and level of the lane of each robot: kinds in turn, then their levels."""
+    number = np.arange(count)
+    return number % len(atlas.kinds), number // len(atlas.kinds) % atlas.levels
+
+
+def begin(world: World, seed: int, count: int) -> rollout.Robots:
+    """Return robots at the start of their lanes."""
+    return trials.begin(world, seed, np.arange(count), *in_turn(world.lanes, count))
 
 
 def name_of_lane(world: World, kind: str) -> str:
@@ -134,7 +150,7 @@ def steps_of(seconds: float, c: Config) -> int:
     Raises:
         ConfigError: the time is not above 0, or above a trial's.
     """
-    most = evaluation.CROSSING_SECONDS
+    most = evaluation.TRIAL_SECONDS
     if not 0.0 < seconds <= most:
         raise ConfigError(f"--seconds must be above 0, up to {most:g}, not {seconds:g}")
     return max(1, round(seconds / c.physics.control_period))
@@ -197,9 +213,8 @@ def terrain_under(
     on the level ground of other lanes, but for the last `before` m before an obstacle.
     """
     names = np.full(x.shape, "", dtype="U16")
-    for k, kind in enumerate(atlas.kinds):
-        mine = (slice(None), np.arange(x.shape[1]) % len(atlas.kinds) == k)
-        names[mine] = _on_lane(atlas.tile(0, k), kind, x[mine], before)
+    for e, (kind, level) in enumerate(zip(*in_turn(atlas, x.shape[1]), strict=True)):
+        names[:, e] = _on_lane(atlas.tile(level, kind), atlas.kinds[kind], x[:, e], before)
     return names
 
 
@@ -207,7 +222,7 @@ def _on_lane(
     ground: Terrain, kind: str, x: Float[np.ndarray, "*n"], before: float
 ) -> Shaped[np.ndarray, "*n"]:
     """Return the kind of ground of robots that are all on this lane."""
-    if kind.startswith("stairs"):
+    if kind in STAIRS:
         shape = profile.of_lane(ground)
         way = profile.flight_at(shape, x)
         way = np.where(way == 0, profile.flight_at(shape, x + before), way)

@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from cref_jax import cli, evaluation, gaze, profile, watch
+from cref_jax import cli, gaze, profile, watch
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
@@ -130,9 +130,9 @@ def main(arguments: list[str] | None = None) -> None:
         kind = watch.kind_of_lane(c, options.kind)
         world = watch.placed(c, world, watch.medium(c), options.command)
         count = watch.crowd(options.num_envs, on_accelerator=512)
-        robots = evaluation.starts(world, options.seed, count)
-        of_kind = np.arange(count) % len(world.lanes.kinds) == world.lanes.kinds.index(kind)
-        followed = np.flatnonzero(of_kind)[:FOLLOWED]
+        robots = watch.begin(world, options.seed, count)
+        kinds, _ = watch.in_turn(world.lanes, count)
+        followed = np.flatnonzero(kinds == world.lanes.kinds.index(kind))[:FOLLOWED]
         if not followed.size:
             raise ConfigError(f"--num-envs must be at least {len(world.lanes.kinds)}: one a lane")
         steps = watch.steps_of(options.seconds, c)
@@ -248,7 +248,8 @@ def strip(
     far = np.where(watched.alive, seen.base_x, -np.inf)[:, followed].max(axis=0)
     place = int(np.argmax(far))
     mine = np.flatnonzero(frames.robot == followed[place])
-    steps = profile.edges(profile.of_lane(world.lanes.tile(0, k)))
+    _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
+    steps = profile.edges(profile.of_lane(world.lanes.tile(levels[followed[place]], k)))
     edge = float(steps[0]) if steps.size else 2.0
     heads = frames.attention.shape[1]
     axes = figure.subplots(2 + heads, len(MOMENTS), squeeze=False)

@@ -6,7 +6,8 @@ draws one row a policy; `--policy` or `--run` names a single one. Writes foothol
 footholds_on_stairs.csv (a row a touchdown). 64 robots take one to two minutes a policy on 4 busy
 cores, 25 s of which are compilation.
 
-Half the robots meet a flight up first, half a flight down: hard stairs, 20 cm rise, 30 cm tread.
+Half the robots meet a flight up, half a flight down: hard stairs, 20 cm rise, 30 cm tread
+(terrains/flight.toml).
 A touchdown is that of either foot on a tread, after at least AIR in the air, of a robot that has
 not failed. Its position is that of the sole's centre, from the tread's nosing (0) towards its riser
 (30 cm), on the way up as on the way down. MAD is the median absolute deviation from the median.
@@ -44,7 +45,8 @@ from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
-KINDS = ("stairs_up", "stairs_down")
+KINDS = ("ascent", "descent")  # of lane, one flight each
+TREAD = 0.30  # m, terrains/flight.toml
 AIR = 0.06  # s; assumed: three control steps, a shorter time is a foot that rocks
 REACH = 0.1  # m, half a sole
 TILT = 0.05  # m from a tread's height to the sole's centre, at most; assumed: tilted by 30 degrees
@@ -67,8 +69,6 @@ class Options:
     run: Path | None = None
     """one run; the newest when nothing is named, or the bundled policy where there is none"""
     rise: float = 0.20
-    """m, of a step"""
-    tread: float = 0.30
     """m, of a step"""
     command: float = 0.6
     """m/s forward"""
@@ -169,10 +169,10 @@ def named(options: Options) -> dict[str, Path]:
 def measured(path: Path, options: Options) -> dict[int, Way]:
     """Return what one policy does on the flights up and on those down."""
     policy, world = watch.opened(None, path, options.engine)
-    shape = {"tread": [options.tread]}
-    stairs = [lanes.single(policy.config.terrain, k, options.rise, shape) for k in KINDS]
+    sizes = {kind: (options.rise,) for kind in KINDS}
+    stairs = lanes.grid(policy.config.terrain, sizes, evaluation.LANE_SEEDS)
     world = watch.placed(policy.config, world, stairs, options.command)
-    robots = evaluation.starts(world, options.seed, watch.crowd(options.num_envs, 2048))
+    robots = watch.begin(world, options.seed, watch.crowd(options.num_envs, 2048))
     steps = watch.steps_of(options.seconds, policy.config)
     watched = watch.watch(world, policy.train, robots, steps, look)
     return summed(world, watched)
@@ -208,42 +208,38 @@ def _feet(world: World, state) -> tuple[Float[Array, "F 3"], Bool[Array, " S"]]:
 
 
 def summed(world: World, watched: Watched) -> dict[int, Way]:
-    """Return what was seen on the flights of each direction, robots on both lanes together."""
+    """Return what was seen on the flights of each direction."""
     alive, seen = watched.alive, watched.seen
-    lane = np.arange(alive.shape[1]) % len(world.lanes.kinds)
-    profiles = [profile.of_lane(world.lanes.tile(0, k)) for k in range(len(world.lanes.kinds))]
-    down = seen.touchdown & alive[..., None] & (seen.air_time >= AIR)
-    t, robot, foot = np.nonzero(down)
+    period = world.config.physics.control_period
+    t, robot, foot = np.nonzero(seen.touchdown & alive[..., None] & (seen.air_time >= AIR))
     sole = seen.sole[t, robot, foot]
     flight, position = np.zeros(len(t), int), np.zeros(len(t))
-    over, passed = np.zeros(alive.shape, int), {way: np.zeros(alive.shape, bool) for way in WAYS}
-    for k, p in enumerate(profiles):
-        mine = lane[robot] == k
-        place = profile.landed(p, sole[mine, 0], sole[mine, 2], REACH, TILT)
+    lane, levels = watch.in_turn(world.lanes, alive.shape[1])
+    onto, over = np.zeros_like(alive), np.zeros_like(alive)
+    for e, (kind, level) in enumerate(zip(lane, levels, strict=True)):
+        stairs, mine = profile.of_lane(world.lanes.tile(level, kind)), robot == e
+        place = profile.landed(stairs, sole[mine, 0], sole[mine, 2], REACH, TILT)
         flight[mine], position[mine] = place.flight, place.position
-        x = seen.base_x[:, lane == k]
-        over[:, lane == k] = profile.flight_at(p, x)
-        for way in WAYS:
-            passed[way][:, lane == k] = x > p.right[p.flight == way].max()
-    period = world.config.physics.control_period
+        treads, x = np.flatnonzero(stairs.flight), seen.base_x[:, e]
+        onto[:, e] = alive[:, e] & (x > stairs.left[treads[0]])
+        over[:, e] = alive[:, e] & (x > stairs.right[treads[-1]])
     foot_hits, shank_hits = (
         watch.onsets(flag & alive[..., None]) for flag in (seen.foot_riser, seen.shank_riser)
     )
-    robots = lambda flag: int((flag & alive).any(axis=0).sum())
     ways = {}
-    for way in WAYS:
-        mine = flight == way
+    for kind, way in enumerate(WAYS):
+        landed, there = flight == way, lane == kind
         ways[way] = Way(
-            robots=alive.shape[1],
-            reached=robots(over == way),
-            crossed=robots(passed[way]),
-            robot=robot[mine],
-            foot=foot[mine],
-            time=(t[mine] + 1) * period,
-            position=position[mine],
-            foot_riser=int(foot_hits.sum()) if way == profile.UP else 0,
-            shank_riser=int(shank_hits.sum()) if way == profile.UP else 0,
-            collided=robots((foot_hits | shank_hits).any(axis=2)) if way == profile.UP else 0,
+            robots=int(there.sum()),
+            reached=int(onto[:, there].any(axis=0).sum()),
+            crossed=int(over[:, there].any(axis=0).sum()),
+            robot=robot[landed],
+            foot=foot[landed],
+            time=(t[landed] + 1) * period,
+            position=position[landed],
+            foot_riser=int(foot_hits[:, there].sum()),
+            shank_riser=int(shank_hits[:, there].sum()),
+            collided=int((foot_hits | shank_hits)[:, there].any(axis=(0, 2)).sum()),
         )
     return ways
 
@@ -270,23 +266,23 @@ def draw(out: Path, found: dict[str, dict[int, Way]], options: Options) -> None:
     for row, (label, ways) in enumerate(found.items()):
         for column, (way, name) in enumerate(WAYS.items()):
             axis = figure.add_subplot(grid[row, column])
-            histogram(axis, ways[way], 100 * options.tread, f"C{row}")
+            histogram(axis, ways[way], f"C{row}")
             axis.set_title(f"{label}, {name}", fontsize=10)
             if row == len(found) - 1:
                 axis.set_xlabel("from nosing (0) towards riser, cm")
     deviations(figure.add_subplot(grid[:, 2]), found)
     figure.suptitle(
         f"Where the sole's centre comes down, both feet: rise {100 * options.rise:g} cm, "
-        f"tread {100 * options.tread:g} cm, {options.command:g} m/s",
+        f"tread {100 * TREAD:g} cm, {options.command:g} m/s",
         fontsize=11,
     )
     figure.savefig(out, dpi=90)
 
 
-def histogram(axis: Axes, way: Way, tread: float, colour: str) -> None:
-    """Draw the touchdowns on treads of `tread` cm, or say that there are none."""
-    edges = np.arange(-10.0, tread + 10.5, 100 * BIN)
-    for x in (0.0, tread):
+def histogram(axis: Axes, way: Way, colour: str) -> None:
+    """Draw the touchdowns between nosing and riser, or say that there are none."""
+    edges = np.arange(-10.0, 100 * TREAD + 10.5, 100 * BIN)
+    for x in (0.0, 100 * TREAD):
         axis.axvline(x, color="0.5", lw=0.8, ls="--")
     axis.set(xlim=(edges[0], edges[-1]), ylabel="share of touchdowns")
     said = [way.came()]

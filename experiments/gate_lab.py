@@ -30,9 +30,10 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, profile, watch
+from cref_jax import cli, profile, watch
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName
+from cref_jax.terrain import Terrain
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -110,9 +111,8 @@ def main(arguments: list[str] | None = None) -> None:
         check(c)
         kind = watch.kind_of_lane(c, options.kind)
         world = watch.placed(c, world, watch.medium(c), options.command)
-        robots = evaluation.starts(
-            world, options.seed, watch.crowd(options.num_envs, on_accelerator=4096)
-        )
+        count = watch.crowd(options.num_envs, on_accelerator=4096)
+        robots = watch.begin(world, options.seed, count)
         steps = watch.steps_of(options.seconds, c)
         watched = watch.watch(world, policy.train, robots, steps, look)
         found = list(rows(world, watched))
@@ -208,13 +208,16 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
         time = t * world.config.physics.control_period
         draw_gate(gate, time, watched.seen.gate[t, best])
         draw_feet(feet, time, ~watched.seen.airborne[t, best])
-        under = draw_ground(ground, time, world, k, watched.seen.pose[t, best, 0])
+        _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
+        lane = world.lanes.tile(levels[best], k)
+        under = draw_ground(ground, time, lane, watched.seen.pose[t, best, 0])
         for at in time[1:][np.diff(under) != 0.0]:
             gate.axvline(at, color="0.8", lw=0.8, zorder=0)
         for axis in (gate, feet):
             axis.tick_params(labelbottom=False)
-        lane = watch.name_of_lane(world, kind)
-        gate.set_title(f"{lane}: the robot that came furthest", fontsize=9)
+        gate.set_title(
+            f"{watch.name_of_lane(world, kind)}: the robot that came furthest", fontsize=9
+        )
     else:
         gate.set_title(f"no robot on {kind}", fontsize=9)
     figure.savefig(out, dpi=90)
@@ -223,7 +226,7 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
 def furthest(world: World, watched: Watched, kind: int) -> tuple[Int[np.ndarray, " t"], int]:
     """Return the steps and the number of the robot that came furthest on a lane."""
     x = np.where(watched.alive, watched.seen.pose[..., 0], -np.inf)
-    x[:, np.arange(x.shape[1]) % len(world.lanes.kinds) != kind] = -np.inf
+    x[:, watch.in_turn(world.lanes, x.shape[1])[0] != kind] = -np.inf
     best = int(np.argmax(x.max(axis=0)))
     return np.flatnonzero(np.isfinite(x[:, best])), best
 
@@ -276,12 +279,10 @@ def draw_feet(axis: Axes, time: Float[np.ndarray, " t"], down: Bool[np.ndarray, 
 def draw_ground(
     axis: Axes,
     time: Float[np.ndarray, " t"],
-    world: World,
-    kind: int,
+    ground: Terrain,
     x: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, " t"]:
     """Draw and return the height of the ground under the pelvis over time, m."""
-    ground = world.lanes.tile(0, kind)
     heights = profile.along(ground)
     under = heights[np.clip((x / ground.cell).astype(int), 0, len(heights) - 1)]
     floor = min(float(under.min()), 0.0) - 0.1

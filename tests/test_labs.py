@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int
 from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
-from cref_jax import config, evaluation, exported, gaze, lanes, profile, runs, watch
+from cref_jax import config, exported, gaze, lanes, profile, runs, watch
 from cref_jax.config import Config, ConfigError
 from cref_jax.profile import DOWN, UP
 from cref_jax.watch import Moment, Watched
@@ -84,39 +84,41 @@ def test_the_flight_under_a_robot():
     ]
 
 
-def test_hard_stairs_have_the_tread_asked_for():
-    c = config.Terrain(name="stairs")
-    for kind, sign in (("stairs_up", 1.0), ("stairs_down", -1.0)):
-        lane = lanes.single(c, kind, 0.20, {"tread": [0.30]})
-        p = profile.of_lane(lane.tile(0, 0))
+def flights(rise: float) -> lanes.Atlas:
+    """Return a lane with a flight up beside one with a flight down."""
+    return lanes.grid(config.Terrain(), {"ascent": (rise,), "descent": (rise,)}, [1])
+
+
+def test_the_stairs_have_the_tread_that_is_drawn():
+    atlas = flights(0.20)
+    for kind, way in enumerate((UP, DOWN)):
+        p = profile.of_lane(atlas.tile(0, kind))
         treads = p.flight != 0
-        assert set(p.flight[treads]) == {UP, DOWN}
-        np.testing.assert_allclose((p.right - p.left)[treads], 0.30, atol=1e-9)
-        np.testing.assert_allclose(np.abs(np.diff(p.height)), 0.20, atol=1e-6)
-        assert sign * p.height.sum() > 0
+        assert set(p.flight[treads]) == {way}
+        np.testing.assert_allclose((p.right - p.left)[treads], foothold_lab.TREAD, atol=1e-9)
+        np.testing.assert_allclose(np.diff(p.height), way * 0.20, atol=1e-6)
 
 
-def test_a_number_of_a_shape_that_does_not_exist_is_refused():
-    with pytest.raises(ConfigError, match="did you mean 'tread'"):
-        lanes.single(config.Terrain(), "stairs_up", 0.2, {"tred": [0.3]})
+def test_robots_stand_on_all_lanes_in_turn():
+    atlas = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.3,)}, [1, 2])
+    kinds, levels = watch.in_turn(atlas, 6)
+    assert list(zip(kinds, levels, strict=True)) == [
+        (0, 0), (1, 0), (0, 1), (1, 1), (0, 0), (1, 0)
+    ]  # fmt: skip
 
 
-def test_lanes_beside_each_other_are_the_lanes():
-    c = config.Terrain()
-    parts = [lanes.single(c, "gap", 0.3), lanes.single(c, "rough", 0.05)]
-    both = lanes.beside(parts)
-    assert both.kinds == ("gap", "rough") and both.is_profile == (True, False)
-    for k, part in enumerate(parts):
-        xy = jnp.array([[2.0, -1.9], [3.3, 0.1], [9.0, 1.9]])
-        height = lambda tile, xy=xy: lanes.terrain.height_at(tile, xy)
-        np.testing.assert_array_equal(height(both.tile(0, k)), height(part.tile(0, 0)))
+def test_medium_lanes_have_the_medium_sizes_of_table_2():
+    atlas = watch.medium(Config())
+    sizes = dict(zip(atlas.kinds, np.asarray(atlas.sizes[0]), strict=True))
+    assert (sizes["stairs_up"], sizes["gap"], sizes["platform"]) == (0.15, 0.50, 0.30)
+    # Table II has no slope and no rough ground: the middle of 0.05 to 0.35 and of 0.02 to 0.06
+    assert (sizes["slope"], sizes["rough"]) == (pytest.approx(0.20), pytest.approx(0.04))
 
 
 def test_what_a_robot_walks_on():
     # flat, and one gap lane whose first trench begins where its heights leave zero
-    gap = lanes.single(config.Terrain(), "gap", 0.5)
-    edge = 0.02 * np.argmax(profile.along(gap.tile(0, 0)) < 0)
-    both = lanes.beside([lanes.single(config.Terrain(), "flat", 0.0), gap])
+    both = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.5,)}, [1])
+    edge = 0.02 * np.argmax(profile.along(both.tile(0, 1)) < 0)
     x = np.array([[1.0, edge - 0.6], [5.0, edge - 0.4], [9.0, edge + 0.2]])
     names = watch.terrain_under(both, x).tolist()
     assert names == [["flat", ""], ["flat", "gap"], ["flat", "gap"]]
@@ -145,9 +147,7 @@ def stairs_steps(touchdown, air_time, x, z, riser):
 
 
 def test_only_touchdowns_before_a_failure_count_and_no_rocking():
-    c = config.Terrain(name="stairs")
-    shape = {"tread": [0.30]}
-    atlas = lanes.beside([lanes.single(c, k, 0.2, shape) for k in ("stairs_up", "stairs_down")])
+    atlas = flights(0.20)
     p = profile.of_lane(atlas.tile(0, 0))
     tread = int(np.flatnonzero(p.flight == UP)[0])
     x = np.full(5, p.left[tread] + 0.1)
@@ -162,26 +162,25 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     world = SimpleNamespace(lanes=atlas, config=Config())
     ways = foothold_lab.summed(world, Watched(alive, seen))
     up, down = ways[UP], ways[DOWN]
-    assert (up.robots, up.reached, up.crossed) == (2, 1, 0)
+    assert (up.robots, up.reached, up.crossed) == (1, 1, 0)
     np.testing.assert_allclose(up.position, [0.1], atol=1e-6)
     assert (up.robot.tolist(), up.foot.tolist(), up.time.tolist()) == ([0], [0], [0.02])
     assert (up.foot_riser, up.shank_riser, up.collided) == (2, 0, 1)
-    assert (down.reached, len(down.position)) == (0, 0)
+    assert (down.robots, len(down.position), down.collided) == (1, 0, 0)
     table = list(foothold_lab.rows({"mine": ways}))
     assert table == [("mine", "ascent", 0, "left", 0.02, pytest.approx(10.0, abs=1e-4))]
 
 
 def test_toes_touch_a_riser_once_they_are_at_it(world):
-    stairs = lanes.single(world.config.terrain, "stairs_up", 0.2, {"tread": [0.3]})
-    world = world.replace(lanes=stairs)
+    world = world.replace(lanes=flights(0.20))
     p = profile.of_lane(world.lanes.tile(0, 0))
-    state = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
+    state = jax.tree.map(lambda a: a[0], watch.begin(world, 0, 1).env)
     links = world.physics.links(state.body)
     toe = foothold_lab.kinematics.points(links, ROBOT.spheres.body, ROBOT.spheres.position)[:, 0]
     feet = jax.jit(lambda s: foothold_lab._feet(world, s)[1])
     for away, touches in ((0.05, False), (0.008, True)):  # m; a sole's sphere has 0.01
         moved = p.left[1] - away - float(toe.max())
-        qpos = state.body.qpos.at[0].add(moved)
+        qpos = state.body.qpos.at[jnp.array([0, 2])].add(jnp.array([moved, 0.05]))  # in the air
         hits = feet(state.replace(body=state.body._replace(qpos=qpos)))
         assert bool(hits.any()) == touches
         assert not hits[ROBOT.spheres.foot < 0].any()
@@ -385,8 +384,8 @@ def counted(world: World, moment: Moment) -> Count:
 def test_nothing_counts_from_a_robots_end_on():
     blind = policy("blind")
     world = runs.world_of(blind.config, "mujoco")
-    world = watch.placed(blind.config, world, [lanes.single(Config().terrain, "flat", 0.0)], 0.6)
-    robots = evaluation.starts(world, 0, 4)
+    world = watch.placed(blind.config, world, lanes.single(Config().terrain, "flat", 0.0), 0.6)
+    robots = watch.begin(world, 0, 4)
     watched = watch.watch(world, blind.train, robots, 200, counted)
     alive, seen = watched
     assert alive[0].all() and not alive[-1].any()  # a random policy falls within 4 s

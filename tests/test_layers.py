@@ -12,7 +12,7 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves", "layers"},
+    {"config", "geometry", "deploy", "leaves", "layers", "paper", "proportion", "stall"},
     {"terrain", "shapes", "robot", "host_call", "film"},
     {"kinematics", "lanes", "host_physics", "profile"},
     {"physics", "depth", "foothold"},
@@ -20,8 +20,9 @@ LAYERS = [
     {"episode"},
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
+    {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in"},
+    {"runs", "peers", "stand_in", "table"},
     {"exported"},
     {"watch"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
