@@ -14,16 +14,17 @@ NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 LAYERS = [
     {"config", "geometry", "deploy", "leaves", "layers", "paper", "proportion", "stall"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
-    {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts"},
+    {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
     {"physics", "depth", "foothold", "evaluation_page"},
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
-    {"rollout", "checkpoint", "distill", "brax_env"},
+    {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"runs", "peers", "stand_in", "table", "run_page"},
     {"exported"},
+    {"watch"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
