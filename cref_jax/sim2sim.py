@@ -21,6 +21,7 @@ from rich.progress import track
 
 from cref_jax import cli, evaluation, exported, runs, scene, stand_in
 from cref_jax.config import ConfigError
+from cref_jax.disturbance import Disturbance
 from cref_jax.evaluation import CROSSING_SECONDS, Crossing
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.world import World
@@ -96,10 +97,10 @@ def walked(world: World, path: Path, options: Options) -> list[Trial]:
     c, contents = world.config, deploy.contents(path)
     joints = deploy.Policy(*contents).joints.names
     body = StandIn(c, lane_of(world), joints)
-    latency = max(0, round(options.latency / c.physics.control_period))
+    late = Disturbance(latency=max(0, round(options.latency / c.physics.control_period)))
 
     def one(start: Start) -> Trial:
-        return stand_in.run(body, deploy.Policy(*contents), start, CROSSING_SECONDS, latency)
+        return stand_in.run(body, deploy.Policy(*contents), start, CROSSING_SECONDS, late)
 
     begun = starts(world, options.seed, options.trials)
     pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())

@@ -12,7 +12,7 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves", "layers", "stall"},
+    {"config", "geometry", "deploy", "leaves", "layers", "stall", "disturbance", "proportion"},
     {"terrain", "shapes", "robot", "host_call", "film"},
     {"kinematics", "lanes", "host_physics"},
     {"physics", "depth", "foothold"},
@@ -21,8 +21,9 @@ LAYERS = [
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in"},
+    {"runs", "peers", "stand_in", "ood"},
     {"exported"},
+    {"ood_suite"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

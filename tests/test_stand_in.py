@@ -10,6 +10,7 @@ from sample import put
 
 from cref_jax import deploy, depth, env, episode, evaluation, scene, sim2sim, stand_in
 from cref_jax.config import Config
+from cref_jax.disturbance import Disturbance
 from cref_jax.physics import Physics
 from cref_jax.stand_in import Lane, StandIn, Start
 
@@ -141,7 +142,7 @@ def test_a_trial_is_the_same_twice_and_says_how_it_went(body):
 
 
 def test_frames_that_come_too_late_are_noticed(body):
-    late = stand_in.run(body, runtime(), STANDING, 0.4, latency=8)
+    late = stand_in.run(body, runtime(), STANDING, 0.4, Disturbance(latency=8))
     assert late.status & deploy.Status.STALE_DEPTH
 
 
