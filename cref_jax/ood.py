@@ -65,23 +65,10 @@ class Scene(NamedTuple):
     def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
         """Add floor and solids to a model."""
         scene.add_checker(spec, FLOOR, scene.TONES, repeat=0.5 / scene.TILE)
-        for part in (*self._floor(), *self.solids):
-            shape = mujoco.mjtGeom.mjGEOM_BOX
-            if part.kind == "cylinder":
-                shape = mujoco.mjtGeom.mjGEOM_CYLINDER
-            geom = spec.worldbody.add_geom(
-                type=shape,
-                pos=part.middle,
-                size=part.size,
-                quat=part.rotation,
-                friction=[friction, 0.005, 0.0001],
-                contype=0,
-                conaffinity=1,
-                group=scene.GROUND,
-                rgba=[*COLOURS[part.look], 1.0],
-            )
-            if part.look == "concrete" and part.middle[2] + part.size[2] <= 0.0:
-                geom.material, geom.rgba = FLOOR, [1.0, 1.0, 1.0, 1.0]
+        for part in self._floor():
+            _add(spec, part, friction).material = FLOOR
+        for part in self.solids:
+            _add(spec, part, friction).rgba = [*COLOURS[part.look], 1.0]
 
     def _floor(self) -> list[Solid]:
         """Return the floor between the ditches, and theirs."""
@@ -197,6 +184,21 @@ def load(path: Path) -> Scene:
     if len(solids) > MOST_SOLIDS:
         raise ConfigError(f"{where}: {len(solids)} solids, more than {MOST_SOLIDS}")
     return Scene(path.stem, file.title, file.end, file.width, file.ditches, tuple(solids))
+
+
+def _add(spec: mujoco.MjSpec, solid: Solid, friction: float) -> mujoco.MjsGeom:
+    """Add a solid to a model, and return its geom."""
+    is_box = solid.kind == "box"
+    return spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX if is_box else mujoco.mjtGeom.mjGEOM_CYLINDER,
+        pos=solid.middle,
+        size=solid.size,
+        quat=solid.rotation,
+        friction=[friction, 0.005, 0.0001],
+        contype=0,
+        conaffinity=1,
+        group=scene.GROUND,
+    )
 
 
 def _part(table: Any, where: str) -> list[Solid]:

@@ -115,8 +115,15 @@ def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) 
 class Canvas:
     """A surface off the screen to draw one model on."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Open the surface.
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int,
+        height: int,
+        azimuth: float = AZIMUTH,
+        elevation: float = ELEVATION,
+    ) -> None:
+        """Open the surface; the camera looks along azimuth and elevation, deg.
 
         Raises:
             ConfigError: this machine has no OpenGL.
@@ -124,7 +131,7 @@ class Canvas:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._model, self._data = model, mujoco.MjData(model)
         self._camera = mujoco.MjvCamera()
-        self._camera.azimuth, self._camera.elevation = AZIMUTH, ELEVATION
+        self._camera.azimuth, self._camera.elevation = azimuth, elevation
         self._camera.distance = DISTANCE
         try:
             self._renderer = mujoco.Renderer(model, height, width)
