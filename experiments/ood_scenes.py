@@ -1,7 +1,8 @@
 """Draw the twenty scenes: `python experiments/ood_scenes.py --out experiments/ood_scenes.png`.
 
 Each is shown with the robot standing in it at the nominal pose, and beside it what the robot's
-depth camera sees there, the far plane and whatever reads nothing in yellow. Takes half a minute.
+depth camera sees there: near is green, the far plane and what reads nothing are dark. Takes
+seconds.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,10 @@ from cref_jax.config import Config
 from cref_jax.stand_in import StandIn
 
 COLUMNS = 4
-SIZE = (480, 330)  # pixels of a picture
+SIZE = (480, 360)  # pixels of a picture, of the depth image's proportions
+AHEAD = np.array([0.75, 0.0, -0.25])  # m, from the pelvis to where the picture's middle is
+VIEW = (128.0, -27.0)  # deg, azimuth and elevation
+VIEWS = {"walled_stairs": (32.0, -36.0)}  # where a wall would hide the robot
 PLACES = {  # m along x where the robot stands; elsewhere 1.3 m, before the first obstacle
     "askew_pallets": 1.7,
     "curbs": 2.6,
@@ -58,21 +62,22 @@ def main() -> None:
     options = tyro.cli(Options)
     c, found = Config(), ood.scenes()
     rows = -(-len(found) // COLUMNS)
-    figure = plt.figure(figsize=(5.2 * COLUMNS, 1.95 * rows), constrained_layout=True)
-    cells = figure.subfigures(rows, COLUMNS, wspace=0.02, hspace=0.0)
+    figure = plt.figure(figsize=(4.9 * COLUMNS, 2.15 * rows))
+    cells = figure.subfigures(rows, COLUMNS)
     for cell, (name, ground) in zip(cells.flat, found.items(), strict=False):
         picture, seen = view(c, ground, PLACES.get(name, 1.3))
-        left, right = cell.subplots(1, 2, width_ratios=[SIZE[0] / SIZE[1], 64 / 48])
+        left, right = cell.subplots(1, 2)
+        cell.subplots_adjust(left=0.02, right=0.98, bottom=0.14, top=0.99, wspace=0.03)
         left.imshow(picture)
         right.imshow(seen, cmap="viridis_r", vmin=0.3, vmax=c.camera.d_max)
-        left.set_title(ground.title, y=-0.17, fontsize=11, loc="left")
+        left.set_title(ground.title, y=-0.155, fontsize=12, loc="left")
         for axis in (left, right):
             axis.set_axis_off()
     figure.savefig(options.out, dpi=72)
     print(f"wrote {options.out}")
 
 
-def view(c: Config, ground: ood.Scene, x: float) -> tuple[np.ndarray, np.ndarray]:
+def view(c: Config, ground: ood.Scene, x: float) -> tuple[film.Frame, np.ndarray]:
     """Return a picture of the robot at x and its depth image, m, d_max where nothing is seen."""
     body = StandIn(c, ground, robot.load(config.Robot(actuated="all")).joint_names)
     state = mujoco.MjData(body.model)
@@ -84,8 +89,8 @@ def view(c: Config, ground: ood.Scene, x: float) -> tuple[np.ndarray, np.ndarray
     seen = body.image(state)
     spec = scene.stage("all", c.physics, -ood.DITCH - scene.BASE)
     ground.add_to(spec, robot.FRICTION)
-    with scene.Canvas(spec.compile(), *SIZE, azimuth=128.0, elevation=-27.0) as canvas:
-        picture = canvas.draw(state.qpos, state.qpos[:3] + [0.75, 0.0, -0.25])
+    with scene.Canvas(spec.compile(), *SIZE, *VIEWS.get(ground.name, VIEW)) as canvas:
+        picture = canvas.draw(state.qpos, state.qpos[:3] + AHEAD)
     return picture, np.where(np.isfinite(seen), np.minimum(seen, c.camera.d_max), c.camera.d_max)
 
 

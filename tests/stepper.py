@@ -5,12 +5,13 @@ own go there in MuJoCo C, and each in turn carries the robot's whole weight. At 
 upper body is led along the way, in its nominal pose, and must meet nothing.
 """
 
+import itertools
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from cref_jax import config, robot, stand_in
+from cref_jax import config, robot
 from cref_jax.config import Config
 from cref_jax.stand_in import StandIn
 
@@ -98,8 +99,8 @@ def rays_down(ground, y: float) -> np.ndarray:
     x = np.arange(START - 0.1, ground.end + 0.5, GRID)
     across = y + np.linspace(*SOLE_Y, 8)
     down, top = np.array([0.0, 0.0, -1.0]), 3.0
-    cast = lambda a, b: top - mujoco.mj_ray(
-        model, state, np.array([a, b, top]), down, None, True, -1, found
+    cast = lambda a, b: (
+        top - mujoco.mj_ray(model, state, np.array([a, b, top]), down, None, True, -1, found)
     )
     return np.array([[cast(a, b) for b in across] for a in x])
 
@@ -141,7 +142,8 @@ def tread(ground, steps: list[Foothold]) -> None:
         k, start = number[step.side], at[step.side]
         goal = np.array([step.x, FOOT_Y[step.side], step.z + ANKLE + 0.01])
         high = max(start[2], goal[2], *(h.z + ANKLE for h in steps if start[0] < h.x < step.x))
-        over = [start + [0, 0, high + 0.1 - start[2]], goal + [0, 0, high + 0.1 - goal[2]], goal]
+        above = lambda point, z=high + 0.1: np.array([*point[:2], z])
+        over = [above(start), above(goal), goal]
         state.eq_active[k] = 1
         pitch = -np.arctan(step.slope)
         state.mocap_quat[k] = [np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0]
@@ -188,7 +190,8 @@ def feet_on(ground) -> mujoco.MjModel:
             name1=f"hand_{side}",
             name2=side,
             active=True,
-            data=[0.0] * 10 + [1.0, 0.0],  # the pose between the two as at the start; turned as well
+            data=[0.0] * 10
+            + [1.0, 0.0],  # the pose between the two as at the start; turned as well
         )
     return spec.compile()
 
@@ -204,8 +207,8 @@ def lead(ground, steps: list[Foothold]) -> None:
         for geom, link in enumerate(links)
         if link != "world" and not any(leg in link for leg in LEGS)
     }
-    x = [0.5 * (a.x + b.x) for a, b in zip(steps, steps[1:], strict=False)]
-    z = [0.5 * (a.z + b.z) for a, b in zip(steps, steps[1:], strict=False)]
+    x = [0.5 * (a.x + b.x) for a, b in itertools.pairwise(steps)]
+    z = [0.5 * (a.z + b.z) for a, b in itertools.pairwise(steps)]
     for at in np.arange(x[0], x[-1], 0.02):
         for sway in SWAY:
             state.qpos[:3] = at, sway, X2.standing_height + np.interp(at, x, z)
@@ -214,6 +217,3 @@ def lead(ground, steps: list[Foothold]) -> None:
             if met:
                 name = next(body.model.geom(g).name for g in met[0].geom if g in upper)
                 raise Impassable(f"{name} meets something at x = {at:.2f} m, {sway:+.2f} m aside")
-
-
-__all__ = ["Foothold", "Impassable", "stand_in", "walk"]

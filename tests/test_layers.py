@@ -21,7 +21,7 @@ LAYERS = [
     {"env", "network", "ppo"},
     {"rollout", "checkpoint", "distill", "brax_env"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in", "ood"},
+    {"runs", "peers", "stand_in", "ood", "ood_verdict"},
     {"exported"},
     {"ood_suite"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
