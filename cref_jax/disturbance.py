@@ -69,11 +69,11 @@ class Channel:
 def regions(
     shape: tuple[int, int], share: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return for each pixel which of `count` connected regions it is in, or -1, i64[H, W].
+    """Return for each pixel which of `count` regions it is in, or -1, i64[H, W].
 
     Together they cover `share` of the image, to the pixel. A region reaches from its middle to
     k r(angle) in each direction, where r is a wobbly outline, so it is in one piece; k is the same
-    for all, and such that the share comes out.
+    for all, and such that the share comes out. Where two overlap, a pixel is in the nearer one.
     """
     rows, columns = shape
     y, x = np.mgrid[:rows, :columns] + 0.5
