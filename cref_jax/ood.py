@@ -29,7 +29,7 @@ FLOOR = "floor"  # name of its material
 R = TypeVar("R")
 Range = tuple[float, float]  # m, from, to
 Point = tuple[float, float, float]  # m
-Look = Literal["concrete", "stone", "wood", "steel", "rail", "plastic", "plant"]
+Look = Literal["concrete", "stone", "wood", "steel", "rail", "plastic", "rubber", "plant"]
 COLOURS: dict[str, tuple[float, float, float]] = {  # red, green, blue
     "concrete": (0.62, 0.62, 0.60),
     "stone": (0.55, 0.50, 0.45),
@@ -37,6 +37,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {  # red, green, blue
     "steel": (0.42, 0.47, 0.53),
     "rail": (0.88, 0.68, 0.12),
     "plastic": (0.20, 0.40, 0.62),
+    "rubber": (0.17, 0.17, 0.18),
     "plant": (0.33, 0.48, 0.26),
 }
 

@@ -38,7 +38,7 @@ START_X, START_Y = (0.5, 1.0), (-0.3, 0.3)  # m; assumed: as in training
 START_YAW = (-0.2, 0.2)  # rad; assumed
 FRAME_RATE = 25.0  # 1/s, of a film
 SIZE = (960, 540)  # pixels of it
-VIEW = (125.0, -26.0)  # deg, azimuth and elevation: from the right and from ahead, over rails
+VIEW = (12.0, -24.0)  # deg, azimuth and elevation: from behind, so that no wall is in the way
 
 GOOD = Condition("undisturbed")
 CONDITIONS = (

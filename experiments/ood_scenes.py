@@ -1,8 +1,7 @@
 """Draw the twenty scenes: `python experiments/ood_scenes.py --out experiments/ood_scenes.png`.
 
 Each is shown with the robot standing in it at the nominal pose, and beside it what the robot's
-depth camera sees there: near is green, the far plane and what reads nothing are dark. Takes
-seconds.
+depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
 """
 
 from dataclasses import dataclass
@@ -26,9 +25,10 @@ from cref_jax.stand_in import StandIn
 
 COLUMNS = 4
 SIZE = (480, 360)  # pixels of a picture, of the depth image's proportions
+NEAR = 0.3  # m, where the scale of the depth images begins
 AHEAD = np.array([0.75, 0.0, -0.25])  # m, from the pelvis to where the picture's middle is
 VIEW = (128.0, -27.0)  # deg, azimuth and elevation
-VIEWS = {"walled_stairs": (32.0, -36.0)}  # where a wall would hide the robot
+VIEWS = {"walled_stairs": (20.0, -22.0)}  # where a wall would hide the robot
 PLACES = {  # m along x where the robot stands; elsewhere 1.3 m, before the first obstacle
     "askew_pallets": 1.7,
     "curbs": 2.6,
@@ -62,18 +62,23 @@ def main() -> None:
     options = tyro.cli(Options)
     c, found = Config(), ood.scenes()
     rows = -(-len(found) // COLUMNS)
-    figure = plt.figure(figsize=(4.9 * COLUMNS, 2.15 * rows))
-    cells = figure.subfigures(rows, COLUMNS)
+    figure = plt.figure(figsize=(4.9 * COLUMNS, 2.15 * rows + 0.8))
+    sheet, foot = figure.subfigures(2, 1, height_ratios=[2.15 * rows, 0.8])
+    cells = sheet.subfigures(rows, COLUMNS)
     for cell, (name, ground) in zip(cells.flat, found.items(), strict=False):
         picture, seen = view(c, ground, PLACES.get(name, 1.3))
         left, right = cell.subplots(1, 2)
         cell.subplots_adjust(left=0.02, right=0.98, bottom=0.14, top=0.99, wspace=0.03)
         left.imshow(picture)
-        right.imshow(seen, cmap="viridis_r", vmin=0.3, vmax=c.camera.d_max)
+        depth = right.imshow(seen, cmap="viridis_r", vmin=NEAR, vmax=c.camera.d_max)
         left.set_title(ground.title, y=-0.155, fontsize=12, loc="left")
         for axis in (left, right):
             axis.set_axis_off()
-    figure.savefig(options.out, dpi=72)
+    bar = figure.colorbar(
+        depth, cax=foot.add_axes((0.35, 0.7, 0.3, 0.15)), orientation="horizontal"
+    )
+    bar.set_label("depth, m", fontsize=12)
+    figure.savefig(options.out, dpi=80)
     print(f"wrote {options.out}")
 
 
