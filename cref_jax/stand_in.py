@@ -31,7 +31,9 @@ class Ground(Protocol):
     The ground always meets soles and shanks, and the links that are kept clear. Where
     `stops_every_link`, it meets arms, knees and the capsules of the feet as well: a hand is stopped
     by a rail, which is no fall, and a foot stands across slots that its spheres would sink into.
-    On a lane there is nothing beside the robot, and contact is as in training, by spheres alone.
+    Pelvis, torso, head and thighs end the trial wherever they touch. On a lane there is nothing
+    beside the robot, and contact is as in training, by spheres alone. On level ground the two are
+    the same: spheres and capsules of a foot end at one height.
     """
 
     @property

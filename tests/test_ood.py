@@ -259,6 +259,21 @@ def test_a_block_slides_where_friction_is_less_than_the_slope(scene, mu, slides)
     assert way == pytest.approx(0.29, rel=0.15) if slides else way < 0.03
 
 
+def test_a_foot_stands_across_slots_that_its_spheres_would_sink_into(scene):
+    # the soles' three rows of spheres lie 9 cm apart, and so do all slots of 4 cm
+    slats = "[[box]]\nx = [0.0, 0.05]\ny = [-1.0, 1.0]\nz = [0.1, 0.15]\n"
+    ground = scene(slats + "count = [20]\nby = [[0.09, 0.0, 0.0]]\n")
+    sunk = {}
+    for stops in (True, False):
+        body = on(ground._replace(stops_every_link=stops))
+        # the rows at x = 0.70, 0.79 and 0.88, in the middle of slots
+        state = placed(body, x=0.755, z=ROBOT.standing_height + 0.152)
+        for _ in range(30):  # 0.15 s
+            mujoco.mj_step(body.model, state)
+        sunk[stops] = 0.15 - (state.xpos[body.feet, 2].mean() - stepper.ANKLE)
+    assert sunk[True] < 0.01 < 0.03 < sunk[False]
+
+
 def rail(y):
     """Return a rail along the path at the height of the hands."""
     return f"[[cylinder]]\nends = [[0.2, {y}, 0.6], [5.0, {y}, 0.6]]\nradius = 0.02\n"
