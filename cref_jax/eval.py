@@ -1,6 +1,7 @@
 """Judge a policy: `python -m cref_jax.eval --suite table`."""
 
 import json
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,17 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from cref_jax import ood_suite  # before numpy and mujoco: it sets their threads and OpenGL
+
+# isort: split
+
 import jax
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cref_jax import cli, evaluation, evaluation_page, exported, paper, runs, table
+from cref_jax import cli, evaluation, evaluation_page, exported, ood_verdict, paper, runs, table
 from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.world import World
 
-Suite = Literal["table", "walk", "cross"]
+Suite = Literal["table", "ood", "walk", "cross"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
 
 
@@ -32,14 +37,20 @@ class Options:
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
     suite: Suite = "table"
-    """table: the twelve cells of Table II and the failures of Table III; cross: trials on lanes
-    with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s"""
+    """table: the twelve cells of Table II and the failures of Table III; ood: twenty scenes in
+    MuJoCo C that nobody was trained on, by the numpy runtime; cross: trials on lanes with obstacles
+    of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s"""
     kind: str = "gap"
     """of the obstacles to cross: gap, stairs_up, stairs_down, platform, rough, slope, flat"""
     size: float = 0.3
     """of the obstacles to cross, m"""
     num_envs: int | None = None
-    """trials of each cell, or episodes; when left out 100 on a CPU and 2000 on an accelerator"""
+    """trials of each cell, or episodes; when left out 100 on a CPU and 2000 on an accelerator; of
+    each scene 10"""
+    stress: int = 2
+    """trials of each scene under each condition: lost, late and partly blind frames, friction"""
+    film: str | None = None
+    """film one trial in this scene instead of judging in all of them: SCENE.mp4"""
     seed: int = 0
     """of the first states and commands"""
     engine: EngineName = "auto"
@@ -64,12 +75,14 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(options.debug):
         cli.prepare()
         subjects = [_subject(path, options.engine) for path in _sources(options)]
-        count = options.num_envs or (100 if jax.default_backend() == "cpu" else paper.TRIALS)
-        started = time.monotonic()
-        judge = {"table": _table, "cross": _cross, "walk": _walk}[options.suite]
-        found = judge(subjects, options, count)
         source = subjects[0].source
         out = options.out or (source if exported.is_run(source) else Path())
+        if options.film:
+            _film(subjects[0], options, out / f"{options.film}.mp4")
+            return
+        started = time.monotonic()
+        judge = {"table": _table, "ood": _ood, "cross": _cross, "walk": _walk}[options.suite]
+        found = judge(subjects, options)
         record = {"suite": options.suite, "seed": options.seed, **_origin(subjects)}
         record |= {"seconds": round(time.monotonic() - started, 1), **found}
         _write(out, record)
@@ -85,6 +98,8 @@ def _sources(options: Options) -> list[Path]:
         raise ConfigError(f"--num-envs must be at least 1, not {options.num_envs}")
     if options.run and options.policy:
         raise ConfigError("give --run or --policy, not both")
+    if options.film and options.suite != "ood":
+        raise ConfigError("--film takes a scene of --suite ood; a lane is filmed by cref_jax.play")
     given = [*options.run, *options.policy]
     if len(given) > 1 and options.suite != "table":
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
@@ -96,9 +111,14 @@ def _subject(source: Path, engine: EngineName) -> Subject:
     return Subject(source, exported.load(source, world), world)
 
 
-def _table(subjects: list[Subject], options: Options, count: int) -> dict[str, Any]:
+def _count(options: Options) -> int:
+    """Return the number of trials."""
+    return options.num_envs or (100 if jax.default_backend() == "cpu" else paper.TRIALS)
+
+
+def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Judge in all cells of Table II."""
-    console = Console()
+    console, count = Console(), _count(options)
     console.print(f"{table.width(count * len(subjects))}\n{table.RULE}", highlight=False)
     judged = []
     with _progress(console, 12 * count * len(subjects)) as ended:
@@ -113,8 +133,35 @@ def _table(subjects: list[Subject], options: Options, count: int) -> dict[str, A
     return {"rule": table.RULE, "cells": rows, "overall": whole}
 
 
-def _cross(subjects: list[Subject], options: Options, count: int) -> dict[str, Any]:
-    subject = subjects[0]
+def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:
+    """Judge in the scenes, through the numpy runtime."""
+    with _exported(subjects[0]) as path:
+        verdict = ood_suite.judge(path, options.num_envs or 10, options.stress, options.seed)
+    ood_verdict.show(verdict, Console())
+    return verdict.as_dict()
+
+
+def _film(subject: Subject, options: Options, out: Path) -> None:
+    """Film the first trial in a scene."""
+    with _exported(subject) as path:
+        trial = ood_suite.film(path, options.film or "", out, options.seed)
+    print(f"wrote {out}: {trial.ending} after {trial.seconds:.1f} s and {trial.progress:.1f} m")
+
+
+@contextmanager
+def _exported(subject: Subject) -> Iterator[Path]:
+    """Yield the policy as an exported one; a run's is written for the time being."""
+    if not exported.is_run(subject.source):
+        yield subject.source
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy"
+        exported.write(subject.policy, subject.world, path)
+        yield path
+
+
+def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
+    subject, count = subjects[0], _count(options)
     with _progress(Console(), count) as ended:
         result = evaluation.cross(
             subject.policy.config, subject.world.physics, subject.policy.train, options.kind,
@@ -124,11 +171,12 @@ def _cross(subjects: list[Subject], options: Options, count: int) -> dict[str, A
     return result._asdict()
 
 
-def _walk(subjects: list[Subject], options: Options, count: int) -> dict[str, Any]:
+def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
     subject = subjects[0]
     result = evaluation.walk(
-        subject.policy.config, subject.world.physics, subject.policy.train, count, options.seed
-    )
+        subject.policy.config, subject.world.physics, subject.policy.train, _count(options),
+        options.seed,
+    )  # fmt: skip
     print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
     return result._asdict()
 

@@ -47,16 +47,40 @@ class Boxes(NamedTuple):
 
 def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) -> mujoco.MjModel:
     """Return the model to draw; its qpos is that of the physics, its x and y those of `ground`."""
-    spec = robot.spec(actuated, physics, contact_planes=0, visual=True)
     heights, origin = window(ground)
-    _add_light(spec)
-    _add_plain(spec, float(heights.min()) - BASE)
+    spec = stage(actuated, physics, float(heights.min()) - BASE)
     found = boxes(heights, max(1, round(TILE / ground.cell)))
     if found is None:
         _add_field(spec, heights, origin, ground.cell)
     else:
         _add_boxes(spec, found, origin, ground.cell)
     return spec.compile()
+
+
+def stage(actuated: robot.Actuated, physics: config.Physics, z: float) -> mujoco.MjSpec:
+    """Return the robot in its light, over an endless plain at height z, m."""
+    spec = robot.spec(actuated, physics, contact_planes=0, visual=True)
+    _add_light(spec)
+    _add_plain(spec, z)
+    return spec
+
+
+def add_checker(
+    spec: mujoco.MjSpec, name: str, tones: tuple[tuple[float, ...], ...], repeat: float
+) -> None:
+    """Add a material with two fields of each tone a period, `repeat` periods a metre."""
+    spec.add_texture(
+        name=name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=tones[0],
+        rgb2=tones[1],
+        width=256,
+        height=256,
+    )
+    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    spec.add_material(name=name, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
 
 
 def window(ground: Terrain) -> tuple[Float[np.ndarray, "X Y"], Float[np.ndarray, "2"]]:
@@ -91,8 +115,15 @@ def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) 
 class Canvas:
     """A surface off the screen to draw one model on."""
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Open the surface.
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int,
+        height: int,
+        azimuth: float = AZIMUTH,
+        elevation: float = ELEVATION,
+    ) -> None:
+        """Open the surface; the camera looks along azimuth and elevation, deg.
 
         Raises:
             ConfigError: this machine has no OpenGL.
@@ -100,7 +131,7 @@ class Canvas:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._model, self._data = model, mujoco.MjData(model)
         self._camera = mujoco.MjvCamera()
-        self._camera.azimuth, self._camera.elevation = AZIMUTH, ELEVATION
+        self._camera.azimuth, self._camera.elevation = azimuth, elevation
         self._camera.distance = DISTANCE
         try:
             self._renderer = mujoco.Renderer(model, height, width)
@@ -212,7 +243,7 @@ def _add_field(
         size=[*(0.5 * extent), max(rise, 1e-3), BASE],
         userdata=((heights - low) / max(rise, 1e-3)).T.ravel(),
     )
-    _add_checker(spec, "lane", TONES, repeat=0.5 / TILE)
+    add_checker(spec, "lane", TONES, repeat=0.5 / TILE)
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_HFIELD,
         hfieldname="lane",
@@ -235,24 +266,6 @@ def _add_plain(spec: mujoco.MjSpec, z: float) -> None:
         conaffinity=0,
         group=GROUND,
     )
-
-
-def _add_checker(
-    spec: mujoco.MjSpec, name: str, tones: tuple[tuple[float, ...], ...], repeat: float
-) -> None:
-    """Add a material with two fields of each tone a period, `repeat` periods a metre."""
-    spec.add_texture(
-        name=name,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=tones[0],
-        rgb2=tones[1],
-        width=256,
-        height=256,
-    )
-    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    spec.add_material(name=name, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:

@@ -21,6 +21,7 @@ from rich.progress import track
 
 from cref_jax import cli, evaluation, exported, runs, scene, stand_in
 from cref_jax.config import ConfigError
+from cref_jax.disturbance import Disturbance
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.world import World
@@ -95,23 +96,27 @@ def walked(world: World, path: Path, options: Options) -> list[Trial]:
     """Return the trials of the policy there, on all cores."""
     c, contents = world.config, deploy.contents(path)
     joints = deploy.Policy(*contents).joints.names
-    body = StandIn(c, lane_of(world), joints)
-    latency = max(0, round(options.latency / c.physics.control_period))
+    bodies = [StandIn(c, lane_of(world, level), joints) for level in range(world.lanes.levels)]
+    late = Disturbance(latency=max(0, round(options.latency / c.physics.control_period)))
 
-    def one(start: Start) -> Trial:
-        return stand_in.run(body, deploy.Policy(*contents), start, TRIAL_SECONDS, latency)
+    def one(start: Start, level: int) -> Trial:
+        policy = deploy.Policy(*contents)
+        return stand_in.run(bodies[level], policy, start, TRIAL_SECONDS, late)
 
     begun = starts(world, options.seed, options.trials)
+    _, levels = evaluation.crossing_lanes(options.trials)
     pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
     try:
-        return list(track(pool.map(one, begun), "walking", total=len(begun), transient=True))
+        return list(
+            track(pool.map(one, begun, levels), "walking", total=len(begun), transient=True)
+        )
     finally:  # Ctrl-C does not wait for those that have not begun
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def lane_of(world: World) -> Lane:
-    """Return the world's one lane."""
-    ground = world.lanes.tile(0, 0)
+def lane_of(world: World, level: int = 0) -> Lane:
+    """Return a lane of a world that has one kind."""
+    ground = world.lanes.tile(level, 0)
     heights, origin = scene.window(ground)
     return Lane(heights, origin, ground.cell, world.lanes.end - world.config.episode.lane_end)
 

@@ -1,20 +1,22 @@
 """The robot's stand-in: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
 
-It knows nothing of the training simulation: the ground is boxes and not tangent planes, depth comes
-from MuJoCo's own ray-cast, the upper body is held by its motors, and the policy is run by deploy.py
-on what a robot measures. Nothing of JAX is in its loop.
+It knows nothing of the training simulation: the ground is solids and not tangent planes, depth
+comes from MuJoCo's own ray-cast, the upper body is held by its motors, and the policy is run by
+deploy.py on what a robot measures. Nothing of JAX is in its loop.
 """
 
+import collections
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from cref_jax import config, robot, scene
+from cref_jax import config, robot, scene, stall
 from cref_jax.config import Config, ConfigError
 from cref_jax.deploy import Policy, Status
+from cref_jax.disturbance import UNDISTURBED, Channel, Disturbance
 
 MOST_BOXES = 20_000
 MARGIN = 4.0  # m around the lane where its border goes on, as in training; further than is seen
@@ -22,13 +24,72 @@ FAR = 1e3  # m, a ray that meets nothing
 GROUND, SEEN, UNSEEN = 0, 1, 2  # geom groups; rays meet the first two
 
 
+@runtime_checkable
+class Ground(Protocol):
+    """What a trial is walked on.
+
+    The ground always meets soles and shanks, and the links that are kept clear. Where
+    `stops_every_link`, it meets arms, knees and the capsules of the feet as well: a hand is stopped
+    by a rail, which is no fall, and a foot stands across slots that its spheres would sink into.
+    Pelvis, torso, head and thighs end the trial wherever they touch. On a lane there is nothing
+    beside the robot, and contact is as in training, by spheres alone. On level ground the two are
+    the same: spheres and capsules of a foot end at one height.
+    """
+
+    @property
+    def end(self) -> float:
+        """Return where along x a trial is won, m; infinite on open ground."""
+        ...
+
+    @property
+    def width(self) -> float:
+        """Return how wide the path is, m; it lies on both sides of y = 0."""
+        ...
+
+    @property
+    def stops_every_link(self) -> bool:
+        """Return whether all links of the robot are solid to it."""
+        ...
+
+    def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
+        """Add its geoms to a model, in the group GROUND."""
+        ...
+
+
 class Lane(NamedTuple):
-    """The ground of a trial."""
+    """A lane of columns, as in training."""
 
     heights: Float[np.ndarray, "X Y"]  # m, of the columns
     origin: Float[np.ndarray, "2"]  # m, outer corner of the first column
     cell: float  # m
     end: float  # m along x where a trial is won; infinite on open ground
+    width: float = math.inf  # m
+    stops_every_link: bool = False
+
+    def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
+        """Add boxes, and a border around them.
+
+        Raises:
+            ConfigError: they are too many.
+        """
+        around = math.ceil(MARGIN / self.cell)
+        heights = np.pad(self.heights, around, mode="edge")
+        origin = self.origin - around * self.cell
+        found = scene.boxes(heights, max(heights.shape), MOST_BOXES)
+        if found is None:
+            raise ConfigError(f"this ground needs more than {MOST_BOXES} boxes")
+        bottom = float(self.heights.min()) - 0.1  # m
+        for first, size, height in zip(found.first, found.size, found.height, strict=True):
+            half = 0.5 * (height - bottom)
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=[*(origin + (first + 0.5 * size) * self.cell), height - half],
+                size=[*(0.5 * size * self.cell), half],
+                friction=[friction, 0.005, 0.0001],
+                contype=0,
+                conaffinity=1,
+                group=GROUND,
+            )
 
 
 class Start(NamedTuple):
@@ -42,7 +103,7 @@ class Start(NamedTuple):
 class Trial(NamedTuple):
     """What became of it."""
 
-    ending: str  # tilted, low, hit, dropped, unstable, finished, timeout
+    ending: str  # tilted, low, hit, dropped, unstable, strayed, finished, stalled, late
     seconds: float
     progress: float  # m along the lane
     speed: float  # m/s forward in the body frame, mean
@@ -53,15 +114,28 @@ class Trial(NamedTuple):
 class StandIn:
     """The compiled model of robot and ground, and where things are in it."""
 
-    def __init__(self, c: Config, lane: Lane, joints: tuple[str, ...]) -> None:
-        """Compile the model; `joints` are those that the policy drives, in its order.
+    def __init__(
+        self,
+        c: Config,
+        ground: Ground,
+        joints: tuple[str, ...],
+        friction: float = robot.FRICTION,
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            c: settings of physics, camera and episodes.
+            ground: what to walk on.
+            joints: those that the policy drives, in its order.
+            friction: coefficient that acts between robot and ground. MuJoCo takes the larger one
+                of two geoms, so that both have it.
 
         Raises:
             ConfigError: the ground needs too many boxes.
         """
-        self.config, self.lane = c, lane
+        self.config, self.ground = c, ground
         self.robot = robot.load(config.Robot(actuated="all"))
-        self.model = model = _spec(c, lane, self.robot).compile()
+        self.model = model = _spec(c, ground, self.robot, friction).compile()
         names = self.robot.joint_names
         self.driven = np.array([names.index(name) for name in joints])
         self.feet = [model.body(f"{side}_ankle_roll_link").id for side in ("left", "right")]
@@ -105,14 +179,19 @@ class StandIn:
 
 
 class _Judge:
-    """Says how a trial ends, by the rules of the training episodes (episode.ending)."""
+    """Says how a trial ends: by the rules of training (episode.ending), astray, or stalled."""
 
-    def __init__(self, body: StandIn, state: mujoco.MjData) -> None:
-        self._body, self._c = body, body.config
+    def __init__(self, body: StandIn, state: mujoco.MjData, speed: float = 0.0) -> None:
+        """Begin with the first state; `speed` is the command, m/s."""
+        self._body, self._c, self._speed = body, body.config, speed
+        self._period = body.config.physics.control_period
+        self._x = collections.deque(
+            [float(state.qpos[0])], round(stall.STALL_SECONDS / self._period) + 1
+        )
         self._support = state.qpos[2] - body.config.reward.base_height_target
 
     def ending(self, state: mujoco.MjData) -> str | None:
-        """Return the first reason to end, or None."""
+        """Return the first reason to end, or None; to be asked after every control step."""
         c, episode, body = self._c, self._c.episode, self._body
         if any(warning.number for warning in state.warning):
             return "unstable"
@@ -122,51 +201,57 @@ class _Judge:
         bearing = force[:, 2] > c.reward.support_force
         if on_ground.any() and bearing.any():
             self._support = float(foot_z[bearing].mean())
-        x, z = state.qpos[0], state.qpos[2]
+        x, y, z = state.qpos[:3]
         upright = state.xmat[body.robot.pelvis].reshape(3, 3)[2, 2]
         reasons = {
             "tilted": upright < math.cos(episode.max_tilt),
             "low": z - self._support < episode.min_height,
             "hit": hit,
             "dropped": foot_z.min() < self._support - episode.below_edge,
-            "finished": x > body.lane.end,
+            "strayed": abs(y) > 0.5 * body.ground.width,
+            "finished": x > body.ground.end,
+            "stalled": self._has_stalled(float(x)),
         }
         return next((name for name, is_so in reasons.items() if is_so), None)
 
+    def _has_stalled(self, x: float) -> bool:
+        """Return whether the robot has stalled now that it is at x, m."""
+        self._x.append(x)
+        return stall.stalled_at(np.array(self._x), self._speed, self._period) is not None
 
-def run(body: StandIn, policy: Policy, start: Start, seconds: float, latency: int = 1) -> Trial:
-    """Let the policy walk once.
+
+def run(
+    body: StandIn,
+    policy: Policy,
+    start: Start,
+    seconds: float,
+    disturbance: Disturbance = UNDISTURBED,
+) -> Trial:
+    """Let the policy walk once, until it falls, is through, or has stalled.
 
     Args:
         body: the model.
         policy: as deploy.py loads it; it is reset.
         start: pose and command.
         seconds: at most.
-        latency: control steps from a frame's exposure until the policy has it.
+        disturbance: what happens to the frames on their way from the camera.
     """
-    c, period = body.config, body.config.physics.control_period
+    c, period, latency = body.config, body.config.physics.control_period, disturbance.latency
     state = _placed(body, start)
-    judge, ending, status, path, speeds = _Judge(body, state), None, Status.OK, [], []
-    frames: list[tuple[int, float, np.ndarray]] = []  # due at a step, exposed at a time
+    judge, channel = _Judge(body, state, start.speed), Channel(disturbance)
+    ending, status, path, speeds = None, Status.OK, [], []
     policy.reset()
-    base = body.robot.pelvis
     for t in range(round(seconds / period)):
         path.append(state.qpos.copy())
-        if frames and frames[0][0] <= t:
-            _, stamp, image = frames.pop(0)
-            status |= policy.on_depth(image, stamp)
-        turned = state.xmat[base].reshape(3, 3)
-        target = policy.step(
-            state.qvel[3:6],
-            -turned[2],
-            steered(c.command, start.speed, state.qpos),
-            state.qpos[7:][body.driven],
-            state.qvel[6:][body.driven],
-            t * period,
-        )
+        if come := channel.receive(t):
+            status |= policy.on_depth(*come)
+        turned = state.xmat[body.robot.pelvis].reshape(3, 3)
+        command = steered(c.command, start.speed, state.qpos)
+        q, qd = state.qpos[7:][body.driven], state.qvel[6:][body.driven]
+        target = policy.step(state.qvel[3:6], -turned[2], command, q, qd, t * period)
         status |= policy.status
-        if not policy.blind and _is_due(t + latency, c):
-            frames.append((t + latency, t * period, body.image(state)))
+        if not policy.blind and _is_due(t + latency, c) and not channel.loses_one():
+            channel.send(body.image(state), t, t * period)
         state.ctrl[body.driven] = target
         for _ in range(c.physics.substeps):
             mujoco.mj_step(body.model, state)
@@ -176,7 +261,7 @@ def run(body: StandIn, policy: Policy, start: Start, seconds: float, latency: in
         if ending:
             break
     return Trial(
-        ending=ending or "timeout",
+        ending=ending or "late",
         seconds=len(path) * period,
         progress=float(state.qpos[0] - start.base[0]),
         speed=float(np.mean(speeds)),
@@ -224,33 +309,17 @@ def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def _spec(c: Config, lane: Lane, whole: robot.Robot) -> mujoco.MjSpec:
+def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> mujoco.MjSpec:
     """Return robot and ground; rays meet the ground and the links that training renders."""
     spec = robot.spec("all", c.physics, contact_planes=0, visual=True)
     capsules = whole.capsules
     in_view = {n for n, yes in zip(capsules.names, capsules.in_view, strict=True) if yes}
     clear = {n for n, yes in zip(capsules.names, capsules.kept_clear, strict=True) if yes}
+    solid = set(capsules.names) if ground.stops_every_link else clear
     for geom in spec.geoms:
         touches = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE
         geom.group = SEEN if geom.name in in_view else UNSEEN
-        geom.contype = int(touches or geom.name in clear)
-        geom.friction = [robot.FRICTION, 0.005, 0.0001]
-    around = math.ceil(MARGIN / lane.cell)
-    heights = np.pad(lane.heights, around, mode="edge")
-    origin = lane.origin - around * lane.cell
-    found = scene.boxes(heights, max(heights.shape), MOST_BOXES)
-    if found is None:
-        raise ConfigError(f"this ground needs more than {MOST_BOXES} boxes")
-    bottom = float(lane.heights.min()) - 0.1  # m
-    for first, size, height in zip(found.first, found.size, found.height, strict=True):
-        half = 0.5 * (height - bottom)
-        spec.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[*(origin + (first + 0.5 * size) * lane.cell), height - half],
-            size=[*(0.5 * size * lane.cell), half],
-            friction=[robot.FRICTION, 0.005, 0.0001],
-            contype=0,
-            conaffinity=1,
-            group=GROUND,
-        )
+        geom.contype = int(touches or geom.name in solid)
+        geom.friction = [friction, 0.005, 0.0001]
+    ground.add_to(spec, friction)
     return spec

@@ -12,7 +12,8 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves", "layers", "paper", "proportion", "stall"},
+    {"config", "geometry", "deploy", "leaves", "layers"},
+    {"paper", "proportion", "stall", "disturbance"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
     {"physics", "depth", "foothold", "evaluation_page"},
@@ -22,9 +23,9 @@ LAYERS = [
     {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in", "table", "run_page"},
-    {"exported"},
-    {"watch"},
+    {"runs", "peers", "stand_in", "table", "run_page", "ood"},
+    {"exported", "ood_verdict"},
+    {"watch", "ood_suite"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

@@ -10,6 +10,7 @@ from sample import put
 
 from cref_jax import deploy, depth, env, episode, evaluation, scene, sim2sim, stand_in
 from cref_jax.config import Config
+from cref_jax.disturbance import Disturbance
 from cref_jax.physics import Physics
 from cref_jax.stand_in import Lane, StandIn, Start
 
@@ -134,14 +135,14 @@ def test_upper_body_on_the_ground_is_a_hit(body):
 def test_a_trial_is_the_same_twice_and_says_how_it_went(body):
     first, second = (stand_in.run(body, runtime(), STANDING, 0.5) for _ in range(2))
     np.testing.assert_array_equal(first.qpos, second.qpos)
-    assert first.ending in ("timeout", "low", "tilted", "hit")
+    assert first.ending in ("late", "low", "tilted", "hit")
     assert first.seconds == pytest.approx(len(first.qpos) * 0.02)
     assert not first.status & (deploy.FAULTS | deploy.Status.STALE_DEPTH | deploy.Status.BAD_DEPTH)
     assert first.status & deploy.Status.NO_DEPTH  # the first frame comes after 60 ms
 
 
 def test_frames_that_come_too_late_are_noticed(body):
-    late = stand_in.run(body, runtime(), STANDING, 0.4, latency=8)
+    late = stand_in.run(body, runtime(), STANDING, 0.4, Disturbance(latency=8))
     assert late.status & deploy.Status.STALE_DEPTH
 
 

@@ -1,0 +1,219 @@
+"""How an exported policy does in scenes that it was not trained on, with good and bad frames.
+
+The policy is run by numpy alone on the robot's stand-in. Every trial is drawn from the seed, the
+scene's name and its own number, so that it is the same whatever else is asked for, and the same
+under every condition: what differs between two conditions is what they do.
+"""
+
+import concurrent.futures
+import functools
+import math
+import multiprocessing
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cref_jax import deploy  # before numpy, whose number of threads it sets
+
+# isort: split
+
+from cref_jax.film import write_video  # before mujoco, whose OpenGL it chooses
+
+# isort: split
+
+import numpy as np
+from rich.progress import track
+
+from cref_jax import evaluation, exported, ood, ood_verdict, robot, scene, stand_in
+from cref_jax.config import Config, ConfigError
+from cref_jax.disturbance import UNDISTURBED, Disturbance
+from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
+from cref_jax.ood import Scene
+from cref_jax.ood_verdict import Condition, Outcome, Verdict
+from cref_jax.stand_in import StandIn, Start, Trial
+
+START_X, START_Y = (0.5, 1.0), (-0.3, 0.3)  # m; assumed: as in training
+START_YAW = (-0.2, 0.2)  # rad; assumed
+FRAME_RATE = 25.0  # 1/s, of a film
+SIZE = (960, 540)  # pixels of it
+VIEW = (12.0, -24.0)  # deg, azimuth and elevation: from behind, so that no wall is in the way
+
+GOOD = Condition("undisturbed")
+CONDITIONS = (
+    *(
+        Condition(f"{100 * p:.0f} % of frames lost", Disturbance(dropped=p))
+        for p in (0.1, 0.3, 0.5)
+    ),
+    *(Condition(f"frames {20 * k} ms late", Disturbance(latency=k)) for k in (1, 2, 3, 4, 5)),
+    *(Condition(f"{100 * p:.0f} % of pixels blind", Disturbance(invalid=p)) for p in (0.2, 0.4)),
+    *(Condition(f"friction {mu}", friction=mu) for mu in (0.4, 0.6, 0.8, 1.0)),
+)  # latency assumes control steps of 20 ms, Sec. II-D
+
+
+class _Job(NamedTuple):
+    """One trial to run."""
+
+    scene: str
+    number: int
+    condition: Condition
+
+
+def judge(
+    policy: Path | None = None,
+    trials: int = 10,
+    stress_trials: int = 2,
+    seed: int = 0,
+    seconds: float = TRIAL_SECONDS,
+    scenes: Mapping[str, Scene] | None = None,
+    workers: int | None = None,
+) -> Verdict:
+    """Return how the policy does in all scenes, undisturbed and under each condition.
+
+    Args:
+        policy: what `export` wrote, or its .zip; the bundled one when left out.
+        trials: of each scene, undisturbed.
+        stress_trials: of each scene under each of CONDITIONS; none of them with 0.
+        seed: of starts, commands and disturbances.
+        seconds: of a trial, at most.
+        scenes: to judge in; those of `terrains/ood` when left out.
+        workers: how many trials at a time; one a core when left out.
+
+    Raises:
+        ConfigError: a number of trials or the seed cannot be, or there is no such policy.
+    """
+    if trials < 1 or stress_trials < 0 or seed < 0:
+        raise ConfigError(
+            "trials must be at least 1, stress trials and seed at least 0, not "
+            f"{trials}, {stress_trials} and {seed}"
+        )
+    path, found = policy or exported.bundled(), dict(scenes or ood.scenes())
+    runner = _Runner(path, found, seed, seconds)
+    conditions = (GOOD, *(CONDITIONS if stress_trials else ()))
+    jobs = [
+        _Job(name, number, condition)
+        for condition in conditions
+        for name in found
+        for number in range(trials if condition is GOOD else stress_trials)
+    ]
+    table = {condition: {name: [] for name in found} for condition in conditions}
+    for job, outcome in zip(jobs, _outcomes(runner, jobs, workers), strict=True):
+        table[job.condition][job.scene].append(outcome)
+    titles = {name: ground.title for name, ground in found.items()}
+    return ood_verdict.verdict(titles, table)
+
+
+def film(
+    policy: Path | None,
+    name: str,
+    out: Path,
+    seed: int = 0,
+    disturbance: Disturbance = UNDISTURBED,
+    number: int = 0,
+    friction: float = robot.FRICTION,
+) -> Trial:
+    """Write an .mp4 of one of `judge`'s trials in the scene of this name, and return the trial.
+
+    Raises:
+        ConfigError: no such scene or policy, no OpenGL, or the file cannot be written.
+    """
+    if out.suffix != ".mp4":
+        raise ConfigError(f"a film must end in .mp4: {out}")
+    ground = ood.named(name)
+    runner = _Runner(policy or exported.bundled(), {name: ground}, seed, TRIAL_SECONDS)
+    trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
+    physics = runner.config.physics
+    spec = scene.stage("all", physics, -ood.DITCH - scene.BASE)
+    ground.add_to(spec, friction)
+    stride = max(1, round(1.0 / (FRAME_RATE * physics.control_period)))
+    points = scene.camera_path(trial.qpos, physics.control_period)
+    with scene.Canvas(spec.compile(), *SIZE, *VIEW) as canvas:
+        moments = track(range(0, len(trial.qpos), stride), "drawing", transient=True)
+        frames = (canvas.draw(trial.qpos[t], points[t]) for t in moments)
+        write_video(out, frames, 1.0 / (stride * physics.control_period))
+    return trial
+
+
+def start(body: StandIn, name: str, seed: int, number: int) -> Start:
+    """Return how the trial of this number begins in the scene of this name."""
+    rng = _rng(name, seed, number)
+    x, y, yaw, speed = (
+        float(rng.uniform(*limits)) for limits in (START_X, START_Y, START_YAW, COMMANDS)
+    )
+    turned = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
+    base = np.array([x, y, body.robot.standing_height, *turned])
+    return Start(base, body.robot.nominal_pose[body.driven], speed)
+
+
+class _Runner:
+    """Runs trials of one policy; keeps what several of them need."""
+
+    def __init__(self, path: Path, scenes: Mapping[str, Scene], seed: int, seconds: float) -> None:
+        if exported.is_run(path):
+            raise ConfigError(f"{path} is no exported policy; make one: python -m cref_jax.export")
+        self.config: Config = evaluation.evaluation_config(exported.read_config(path), seconds)
+        self.arguments = (path, scenes, seed, seconds)
+        self._contents = deploy.contents(path)
+        self._scenes, self._seed, self._seconds = scenes, seed, seconds
+        self._body = functools.cache(self._compiled)
+
+    def policy(self) -> deploy.Policy:
+        """Return the policy, reset."""
+        return deploy.Policy(*self._contents)
+
+    def outcome(self, job: _Job) -> Outcome:
+        """Return what a trial is counted by."""
+        t = self.trial(job)
+        return Outcome(t.ending, t.seconds, t.progress, t.speed, t.status)
+
+    def trial(self, job: _Job) -> Trial:
+        """Return the trial."""
+        body = self._body(job.scene, job.condition.friction)
+        begun = start(body, job.scene, self._seed, job.number)
+        fate = int(_rng(job.scene, self._seed, job.number, 1).integers(2**32))
+        disturbance = job.condition.disturbance._replace(seed=fate)
+        return stand_in.run(body, self.policy(), begun, self._seconds, disturbance)
+
+    def _compiled(self, name: str, friction: float) -> StandIn:
+        return StandIn(self.config, self._scenes[name], self.policy().joints.names, friction)
+
+
+def _outcomes(runner: _Runner, jobs: Sequence[_Job], workers: int | None) -> list[Outcome]:
+    """Run the trials.
+
+    In processes: numpy's share of a control step is many small calls, which threads of one
+    interpreter take turns at. A fresh interpreter each, since JAX does not survive a fork.
+    """
+    shown = functools.partial(track, description="walking", total=len(jobs), transient=True)
+    workers = workers or os.cpu_count() or 1
+    if workers == 1:
+        return [runner.outcome(job) for job in shown(jobs)]
+    pool = concurrent.futures.ProcessPoolExecutor(
+        min(workers, len(jobs)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=runner.arguments,
+    )
+    try:
+        return list(shown(pool.map(_one, jobs)))
+    finally:  # Ctrl-C does not wait for those that have not begun
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _rng(name: str, seed: int, number: int, what: int = 0) -> np.random.Generator:
+    """Return the generator of a trial; `what` is 0 for its start, 1 for its disturbance."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode()), number, what])
+
+
+_worker: _Runner | None = None  # of a worker's process: policy and models are made once in each
+
+
+def _begin(*arguments: Any) -> None:
+    global _worker
+    _worker = _Runner(*arguments)
+
+
+def _one(job: _Job) -> Outcome:
+    assert _worker is not None
+    return _worker.outcome(job)

@@ -1,0 +1,194 @@
+"""What the trials in the scenes come to: the records, how they are counted, and their tables."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cref_jax import robot
+from cref_jax.deploy import Status
+from cref_jax.disturbance import UNDISTURBED, Disturbance
+from cref_jax.proportion import wilson
+
+PASSED = 0.5  # share of a scene's trials that must come to its end; assumed: the paper counts
+# scenes, and does not say what it takes
+RULE = (
+    f"A scene is passed when at least {PASSED:.0%} of its trials come to its end within 40 s, "
+    "without a fall, a step off the path or a stall (less than 0.3 of the commanded distance over 10 s)."
+)
+
+
+class Condition(NamedTuple):
+    """What the trials are run under."""
+
+    name: str
+    disturbance: Disturbance = UNDISTURBED
+    friction: float = robot.FRICTION
+
+
+class Outcome(NamedTuple):
+    """What a trial is counted by; see stand_in.Trial."""
+
+    ending: str
+    seconds: float
+    progress: float  # m
+    speed: float  # m/s
+    status: Status
+
+
+class SceneResult(NamedTuple):
+    """The outcome of the undisturbed trials in one scene."""
+
+    name: str
+    title: str
+    trials: int
+    successes: int
+    failures: dict[str, int]  # by cause
+    rate: float
+    wilson_low: float
+    wilson_high: float
+    seconds: float | None  # mean time of a success
+    passed: bool
+
+
+class ConditionResult(NamedTuple):
+    """The outcome of the trials in all scenes under one condition."""
+
+    name: str
+    dropped: float  # share of frames
+    latency: int  # control steps
+    invalid: float  # share of the image
+    friction: float
+    trials: int
+    successes: int
+    failures: dict[str, int]  # by cause
+    rate: float
+    wilson_low: float
+    wilson_high: float
+    by_scene: dict[str, int]  # successes
+    passed: int  # scenes
+    said: dict[str, int]  # trials in which the policy noticed this
+
+
+class Verdict(NamedTuple):
+    """Everything that was measured."""
+
+    rule: str  # how trials and scenes are counted
+    passed: int  # scenes
+    scenes: tuple[SceneResult, ...]
+    conditions: tuple[ConditionResult, ...]  # the undisturbed one first
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what JSON can hold."""
+        return {
+            **self._asdict(),
+            "scenes": [result._asdict() for result in self.scenes],
+            "conditions": [result._asdict() for result in self.conditions],
+        }
+
+
+def verdict(titles: dict[str, str], table: dict[Condition, dict[str, list[Outcome]]]) -> Verdict:
+    """Return what all trials come to.
+
+    Args:
+        titles: of the scenes, by their names.
+        table: outcomes by condition, the undisturbed one first, and by scene.
+    """
+    undisturbed = next(iter(table.values()))
+    each = [scene_result(name, titles[name], found) for name, found in undisturbed.items()]
+    return Verdict(
+        rule=RULE,
+        passed=sum(result.passed for result in each),
+        scenes=tuple(each),
+        conditions=tuple(condition_result(*row) for row in table.items()),
+    )
+
+
+def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneResult:
+    """Return what the undisturbed trials in one scene come to."""
+    rate = wilson(successes(outcomes), len(outcomes))
+    seconds = [o.seconds for o in outcomes if o.ending == "finished"]
+    return SceneResult(
+        name=name,
+        title=title,
+        trials=len(outcomes),
+        successes=successes(outcomes),
+        failures=by_cause(outcomes),
+        rate=rate.value,
+        wilson_low=rate.low,
+        wilson_high=rate.high,
+        seconds=float(np.mean(seconds)) if seconds else None,
+        passed=is_passed(outcomes),
+    )
+
+
+def condition_result(condition: Condition, by_scene: dict[str, list[Outcome]]) -> ConditionResult:
+    """Return what the trials in all scenes under one condition come to."""
+    every = [outcome for outcomes in by_scene.values() for outcome in outcomes]
+    rate = wilson(successes(every), len(every))
+    said = Counter(flag.name for o in every for flag in Status if flag & o.status)
+    return ConditionResult(
+        name=condition.name,
+        dropped=condition.disturbance.dropped,
+        latency=condition.disturbance.latency,
+        invalid=condition.disturbance.invalid,
+        friction=condition.friction,
+        trials=len(every),
+        successes=successes(every),
+        failures=by_cause(every),
+        rate=rate.value,
+        wilson_low=rate.low,
+        wilson_high=rate.high,
+        by_scene={name: successes(outcomes) for name, outcomes in by_scene.items()},
+        passed=sum(is_passed(outcomes) for outcomes in by_scene.values()),
+        said={str(name): count for name, count in said.items()},
+    )
+
+
+def successes(outcomes: Sequence[Outcome]) -> int:
+    """Return how many came to the end."""
+    return sum(o.ending == "finished" for o in outcomes)
+
+
+def by_cause(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    """Return how many failed for each cause, the most frequent first."""
+    return dict(Counter(o.ending for o in outcomes if o.ending != "finished").most_common())
+
+
+def is_passed(outcomes: Sequence[Outcome]) -> bool:
+    """Return whether a scene counts as passed, by `RULE`."""
+    return successes(outcomes) >= PASSED * len(outcomes)
+
+
+def show(verdict: Verdict, console: Console) -> None:
+    """Print the verdict as two tables."""
+    by_scene = Table(title=f"{verdict.passed} of {len(verdict.scenes)} scenes passed")
+    for column in ("scene", "trials", "to the end", "95 %", "failures"):
+        by_scene.add_column(column, justify="left" if column in ("scene", "failures") else "right")
+    for r in verdict.scenes:
+        by_scene.add_row(
+            r.title, str(r.trials), str(r.successes), _interval(r), _causes(r.failures),
+            style="green" if r.passed else "",
+        )  # fmt: skip
+    console.print(by_scene)
+    by_condition = Table(title="the same scenes under conditions")
+    for column in ("condition", "trials", "to the end", "95 %", "scenes passed", "failures"):
+        left = column in ("condition", "failures")
+        by_condition.add_column(column, justify="left" if left else "right")
+    for r in verdict.conditions:
+        by_condition.add_row(
+            r.name, str(r.trials), str(r.successes), _interval(r), str(r.passed),
+            _causes(r.failures),
+        )  # fmt: skip
+    console.print(by_condition)
+
+
+def _interval(result: SceneResult | ConditionResult) -> str:
+    return f"{result.wilson_low:.0%} to {result.wilson_high:.0%}"
+
+
+def _causes(causes: dict[str, int]) -> str:
+    return ", ".join(f"{count} {cause}" for cause, count in causes.items())

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from cref_jax import disturbance
+from cref_jax.disturbance import Channel, Disturbance
+
+SHAPE = (48, 64)
+FRAME = np.full(SHAPE, 2.0, np.float32)
+
+
+def sent(d, count):
+    """Return what a policy gets of so many equal frames."""
+    channel, frames = Channel(d), []
+    for step in range(count):
+        channel.send(FRAME, step, 0.0)
+        come = channel.receive(step + d.latency)
+        assert come is not None
+        frames.append(come[0])
+    return frames
+
+
+def blind(frame):
+    return np.isnan(frame) | (frame == 0.0)
+
+
+def test_an_undisturbed_frame_comes_as_it_was_one_step_later():
+    channel = Channel(Disturbance())
+    assert not any(channel.loses_one() for _ in range(100))
+    channel.send(FRAME, 7, 0.14)
+    assert channel.receive(7) is None
+    frame, stamp = channel.receive(8)
+    np.testing.assert_array_equal(frame, FRAME)
+    assert stamp == 0.14
+    assert channel.receive(9) is None
+
+
+def test_late_frames_come_in_their_order():
+    channel = Channel(Disturbance(latency=5))
+    for step in (0, 2, 5):  # the second is on its way before the first has come
+        channel.send(FRAME, step, float(step))
+    come = {step: channel.receive(step) for step in range(12)}
+    assert {step: found[1] for step, found in come.items() if found} == {5: 0.0, 7: 2.0, 10: 5.0}
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.5])
+def test_the_stated_share_of_frames_is_lost(share):
+    channel = Channel(Disturbance(dropped=share))
+    lost = np.mean([channel.loses_one() for _ in range(10_000)])
+    assert lost == pytest.approx(share, abs=0.02)  # 4 standard deviations of 0.005
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_the_stated_share_of_the_image_is_blind_in_every_frame(share):
+    for seed in range(5):
+        for frame in sent(Disturbance(invalid=share, seed=seed), 30):
+            assert blind(frame).sum() == round(share * FRAME.size)
+            np.testing.assert_array_equal(frame[~blind(frame)], 2.0)
+
+
+def test_blind_pixels_read_zero_or_nothing():
+    frames = np.stack(sent(Disturbance(invalid=0.3), 400))
+    assert 0.1 < np.isnan(frames).sum() / blind(frames).sum() < 0.9
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_regions_are_large_pieces(count):
+    for seed in range(20):
+        which = disturbance.regions(SHAPE, 0.4, count, np.random.default_rng(seed))
+        assert ndimage.label(which >= 0, np.ones((3, 3)))[1] <= count
+
+
+def test_regions_stay_for_a_while_and_then_move():
+    frames = sent(Disturbance(invalid=0.3), 400)
+    changes = [
+        k for k in range(1, 400) if not np.array_equal(blind(frames[k]), blind(frames[k - 1]))
+    ]
+    stays = np.diff([0, *changes])
+    assert 20 < len(changes) < 100
+    assert stays.min() >= 4 and stays.max() <= 20
+
+
+def test_it_is_all_in_the_seed():
+    bad = Disturbance(dropped=0.3, invalid=0.3, seed=4)
+    same, other = sent(bad, 20), sent(bad._replace(seed=5), 20)
+    np.testing.assert_array_equal(sent(bad, 20), same)
+    assert not np.array_equal(blind(same[0]), blind(other[0]))
+    np.testing.assert_array_equal(sent(bad._replace(dropped=0.0), 20), same)
+
+
+def test_losing_frames_does_not_change_which_pixels_are_blind():
+    bad = Disturbance(dropped=0.5, invalid=0.3, seed=4)
+    channel = Channel(bad)
+    for _ in range(50):
+        channel.loses_one()
+    channel.send(FRAME, 0, 0.0)
+    np.testing.assert_array_equal(channel.receive(1)[0], sent(bad, 1)[0])
