@@ -11,7 +11,7 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
-.PHONY: help setup train eval play export sim2sim bench params test test-fast check format clean
+.PHONY: help setup train eval play report export sim2sim bench params test test-fast check format clean
 
 help:
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -26,6 +26,9 @@ eval: $(READY)  ## measure success rates: ARGS="--run runs/NAME --suite table"
 
 play: $(READY)  ## watch a policy: ARGS="--run runs/NAME"
 	$(BIN)/python -m cref_jax.play $(ARGS)
+
+report: $(READY)  ## gather a run into one page: ARGS="--run runs/NAME"
+	$(BIN)/python -m cref_jax.report $(ARGS)
 
 export: $(READY)  ## write a policy for the robot: ARGS="--run runs/NAME --out policy"
 	$(BIN)/python -m cref_jax.export $(ARGS)

@@ -82,6 +82,8 @@ class Reward:
 
     weights: RewardWeights = field(default_factory=RewardWeights)
     times_dt: bool = True  # assumed: legged_gym's convention
+    event_time: float = 0.1  # s that a touchdown counts for then; assumed: for one control step, as
+    # legged_gym has it, air time and footholds weigh too little to lengthen a step
     clip_at_zero: bool = True  # assumed: without it the negative sum at first teaches falling
     sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym
     sigma_omega: float = 0.25  # rad^2/s^2; assumed: legged_gym
@@ -173,7 +175,7 @@ class Curriculum:
 
     enabled: bool = True
     up: float = 0.5  # of the lane walked: one level harder
-    down: float = 0.5  # less than this share of the commanded distance: one level easier
+    down: float = 0.5  # less than this share of what the episode asked for: one level easier
     start_level: int = 2  # highest level at the start
     review: float = 0.25  # share of episodes on a lower level, so that none is forgotten
 

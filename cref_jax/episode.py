@@ -168,20 +168,29 @@ def promoted(
     """Return the rank after an episode, and the level of the next.
 
     A good episode on the level of its rank earns the robot the next one, a poor one costs it this
-    one. Most episodes are on that level; some, and all after the hardest one has been passed, are
-    on any level up to it, since a robot forgets what it no longer meets.
+    one: it went less than a share of what the whole episode asked for, however it ended. Most
+    episodes are on that level; some, and all after the hardest one has been passed, are on any
+    level up to it, since a robot forgets what it no longer meets.
     """
     c, top = world.config.curriculum, world.lanes.levels - 1
     if not c.enabled:
         return state.rank, state.level
     walked = state.body.qpos[0] - state.start[0]
     up = ~over.terminated & (over.finished | (walked > c.up * world.lanes.length))
-    down = ~up & (walked < c.down * state.commanded)
+    down = ~up & (walked < c.down * _asked(world, state))
     earned = state.rank + (up.astype(jnp.int32) - down) * (state.level == state.rank)
     rank = jnp.clip(earned, 0, top)
     key_review, key_level = jax.random.split(key)
     review = (earned > top) | (jax.random.uniform(key_review) < c.review)
     return rank, jnp.where(review, jax.random.randint(key_level, (), 0, rank + 1), rank)
+
+
+def _asked(world: World, state: EnvState) -> Float[Array, ""]:
+    """Return the distance that the command asks for in a whole episode, at most the lane, m."""
+    c = world.config
+    left = c.episode.length - state.step * c.physics.control_period
+    asked = state.commanded + left * jnp.linalg.norm(state.command[:2])
+    return jnp.minimum(asked, world.lanes.end - c.episode.lane_end - state.start[0])
 
 
 def _placed(world: World, key: PRNGKeyArray) -> Body:

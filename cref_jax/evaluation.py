@@ -1,14 +1,15 @@
 """How well a policy walks: deterministic episodes, counted until each robot's first end."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import lanes, ppo, rollout
+from cref_jax import lanes, ppo, rollout, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
@@ -16,9 +17,8 @@ from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # of an episode on flat ground; assumed
-CROSSING_SECONDS = 40.0  # of a trial on a lane, Sec. III-A
-FALLS = ("tilted", "low", "hit", "dropped", "unstable")  # of Ending
-WALK_SEED = 1_000_003  # apart from the seeds of training
+TRIAL_SECONDS = 40.0  # at most, of a trial on a lane, Sec. III-A
+LANE_SEEDS = tuple(range(1001, 1006))  # of the lanes of trials: others than those of training
 
 
 class Walk(NamedTuple):
@@ -44,13 +44,13 @@ class Walk(NamedTuple):
 
 
 class Crossing(NamedTuple):
-    """The outcome of E trials on one kind of lane with obstacles of one size."""
+    """The outcome of trials on lanes of one kind with obstacles of one size."""
 
     kind: str
     size_m: float
     trials: int
     successes: int  # came to the lane's end in time
-    by_cause: dict[str, int]  # of the failures; timeout: it stood, or was too slow
+    by_cause: dict[str, int]  # of the failures
     seconds: float  # mean time of a success
     speed: float  # m/s forward, mean over the trials
 
@@ -94,7 +94,7 @@ def walk(
     flat = dataclasses.replace(c.terrain, name="flat")
     world = make_world(evaluation_config(dataclasses.replace(c, terrain=flat)), physics)
     steps = round(SECONDS / c.physics.control_period)
-    key = jax.random.key(WALK_SEED + seed)
+    key = jax.random.key(trials.SEED + seed)
     ending, trace = _episodes(world, train, key, episodes, steps)
     return _judged(jax.tree.map(np.asarray, ending), jax.tree.map(np.asarray, trace), c)
 
@@ -105,42 +105,55 @@ def cross(
     train: ppo.TrainState,
     kind: str,
     size: float,
-    trials: int = 200,
+    count: int = 200,
     seed: int = 0,
+    ended: Callable[[int], None] = lambda count: None,
 ) -> Crossing:
-    """Return how often the policy's mean action comes to the end of a lane with such obstacles."""
+    """Return how often the policy's mean action comes to the end of lanes with such obstacles."""
     world = crossing_world(c, physics, kind, size)
-    steps = round(CROSSING_SECONDS / c.physics.control_period)
-    key = jax.random.key(WALK_SEED + seed)
-    ending, trace = jax.tree.map(np.asarray, _episodes(world, train, key, trials, steps))
-    done = ending.finished & ~ending.terminated
-    lived = trace.alive.sum(axis=0)
-    seconds = lived * c.physics.control_period
+    made = trials.run(world, trials.follow(train), *crossing_lanes(count), seed, block(), ended)
+    done = made.succeeded
     return Crossing(
         kind=kind,
         size_m=size,
-        trials=trials,
+        trials=count,
         successes=int(done.sum()),
-        by_cause=_by_cause(ending, (*FALLS, "timeout")),
-        seconds=float(seconds[done].mean()) if done.any() else float("nan"),
-        speed=float((np.sum(trace.forward_speed * trace.alive, axis=0) / lived).mean()),
+        by_cause=made.failures(),
+        seconds=float(made.seconds[done].mean()) if done.any() else float("nan"),
+        speed=float(made.forward.mean()),
     )
 
 
 def crossing_world(c: Config, physics: Physics, kind: str, size: float) -> World:
-    """Return the world of the trials on one kind of lane with obstacles of one size, m."""
-    c = evaluation_config(c, CROSSING_SECONDS)
-    return make_world(c, physics).replace(lanes=lanes.single(c.terrain, kind, size))
+    """Return the world of trials on lanes of one kind with obstacles of one size, m."""
+    atlas = lanes.grid(c.terrain, {kind: (size,)}, LANE_SEEDS)
+    return make_world(trial_config(c), physics).replace(lanes=atlas)
+
+
+def crossing_lanes(count: int) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+    """Return kind and level of the lanes of so many trials in `crossing_world`: each in turn."""
+    return np.zeros(count, np.int32), np.arange(count, dtype=np.int32) % len(LANE_SEEDS)
+
+
+def trial_config(c: Config) -> Config:
+    """Return the configuration of trials: that of evaluation, without what training alone needs.
+
+    So policies of one network share one compiled program.
+    """
+    base = Config()
+    c = dataclasses.replace(c, run=base.run, ppo=base.ppo, curriculum=base.curriculum)
+    c = dataclasses.replace(c, terrain=dataclasses.replace(c.terrain, name="flat"))
+    return evaluation_config(c, TRIAL_SECONDS)
+
+
+def block() -> int:
+    """Return how many robots are stepped together in trials; assumed: fills the device."""
+    return 100 if jax.default_backend() == "cpu" else 1000
 
 
 def starts(world: World, seed: int, count: int) -> rollout.Robots:
-    """Return the robots as the trials of this seed begin."""
-    return _starts(world, jax.random.key(WALK_SEED + seed), count)
-
-
-def _starts(world: World, key: PRNGKeyArray, count: int) -> rollout.Robots:
-    robots = rollout.start(world, key, count)
-    return robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
+    """Return the robots as the trials of this seed begin in `crossing_world`."""
+    return trials.begin(world, seed, np.arange(count), *crossing_lanes(count))
 
 
 @jax.jit(static_argnames=("episodes", "steps"))
@@ -149,7 +162,8 @@ def _episodes(
 ) -> tuple[Ending, _Step]:
     """Return each robot's first end, and its steps [T, E] up to there."""
     nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
-    robots = _starts(world, key, episodes)
+    robots = rollout.start(world, key, episodes)
+    robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
 
     def step(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
@@ -173,13 +187,11 @@ def _episodes(
     return Ending(*(flag.any(axis=0) for flag in endings)), trace
 
 
-def _by_cause(ending: Ending, causes: tuple[str, ...]) -> dict[str, int]:
-    """Return how many robots failed for each cause; one that has several counts for the first."""
-    counts, left = {}, ~np.asarray(ending.finished & ~ending.terminated)
-    for cause in causes:
-        of_this = left & np.asarray(getattr(ending, cause))
-        counts[cause], left = int(of_this.sum()), left & ~of_this
-    return counts
+def _by_cause(ending: Ending) -> dict[str, int]:
+    """Return how many robots fell in each way; one that did in several counts for the first."""
+    flags = np.stack([getattr(ending, name) for name in trials.FALLS])
+    first = np.where(flags.any(axis=0), flags.argmax(axis=0), -1)
+    return {name: int((first == k).sum()) for k, name in enumerate(trials.FALLS)}
 
 
 def _judged(ending: Ending, trace: _Step, c: Config) -> Walk:
@@ -192,7 +204,7 @@ def _judged(ending: Ending, trace: _Step, c: Config) -> Walk:
     return Walk(
         episodes=alive.shape[1],
         fell=int(ending.terminated.sum()),
-        by_cause=_by_cause(ending, FALLS),
+        by_cause=_by_cause(ending),
         speed_error=float(np.abs(of_episode(trace.forward_error)).mean()),
         tracking_error=float(of_episode(trace.tracking_error).mean()),
         airborne=(float(airborne[0]), float(airborne[1])),

@@ -139,6 +139,17 @@ def read(path: Path, world: World | None = None) -> Policy:
     return Policy(c, train, content["provenance"]["iteration"], path)
 
 
+def digest(policy: Policy) -> str:
+    """Return the SHA-256 of all that decides what a policy does, the same for run and export."""
+    found = hashlib.sha256(json.dumps(dataclasses.asdict(policy.config.network)).encode())
+    arrays = leaves.on_host(policy.train.params.actor["params"])
+    seen = policy.train.statistics.obs
+    for name, array in sorted({**arrays, "mean": seen.mean, "std": seen.std}.items()):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(array, np.float32).tobytes())
+    return found.hexdigest()
+
+
 def manifest(policy: Policy, driven: robot.Robot) -> dict[str, Any]:
     """Return everything but the weights, without digests."""
     c = policy.config
@@ -318,7 +329,7 @@ def _provenance(policy: Policy) -> dict[str, Any]:
         "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "run": policy.run.name,
         "iteration": policy.iteration,
-        "samples": policy.iteration * c.run.num_envs * c.ppo.horizon,
+        "samples": policy.samples,
         "trained_by": start,
         "config": json.loads(json.dumps(dataclasses.asdict(c))),
     }

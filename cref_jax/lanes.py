@@ -7,7 +7,7 @@ the highest level, and gives what else their shapes need. A user's own height ma
 import dataclasses
 import difflib
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
@@ -69,15 +69,26 @@ def build(c: config.Terrain) -> Atlas:
     _check_lane(c)
     numbers = _numbers(c.name)
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
-    return _atlas(c, numbers, sizes)
+    return _atlas(c, numbers, sizes, [c.seed] * c.levels)
 
 
 def single(c: config.Terrain, kind: str, size: float) -> Atlas:
     """Return one lane of one kind whose obstacles have exactly this size, m."""
+    return grid(c, {kind: (size,)}, [c.seed])
+
+
+def grid(c: config.Terrain, sizes: Mapping[str, Sequence[float]], seeds: Sequence[int]) -> Atlas:
+    """Return lanes with obstacles of exactly these sizes of each kind, m, drawn with each seed.
+
+    Level `i * len(seeds) + j` of a kind has its size i and seed j; all kinds have as many sizes.
+    """
     _check_lane(c)
-    if not size >= 0.0:
-        raise ConfigError(f"the size of '{kind}' must not be below zero: {size}")
-    return _atlas(c, {kind: _numbers_of(c, kind)}, np.array([[size]]))
+    for kind, of_kind in sizes.items():
+        if not min(of_kind) >= 0.0:
+            raise ConfigError(f"the size of '{kind}' must not be below zero: {min(of_kind)}")
+    numbers = {kind: _numbers_of(c, kind) for kind in sizes}
+    levels = np.repeat(np.array(list(sizes.values()), float).T, len(seeds), axis=0)
+    return _atlas(c, numbers, levels, list(seeds) * (len(levels) // len(seeds)))
 
 
 def named_sizes(c: config.Terrain, kind: str) -> dict[str, float]:
@@ -136,15 +147,18 @@ class _MapFile:
     scale: float  # m for one step of the map's values
 
 
-def _atlas(c: config.Terrain, numbers: dict[str, _Numbers], sizes: np.ndarray) -> Atlas:
-    """Return the lanes of each kind, a column of tiles, at each of its sizes [levels, kinds]."""
+def _atlas(
+    c: config.Terrain, numbers: dict[str, _Numbers], sizes: np.ndarray, seeds: list[int]
+) -> Atlas:
+    """Return the lanes of each kind, a column of tiles, at its sizes [levels, kinds] and seeds."""
     along, across = columns(c.lane_length, c), columns(c.lane_width, c)
     _check_columns((along * sizes.shape[0], across * sizes.shape[1]), f"terrain '{c.name}'")
     heights = np.empty((sizes.shape[0], along, sizes.shape[1], across), np.float32)
     for k, (kind, n) in enumerate(numbers.items()):
         for level, size in enumerate(sizes[:, k]):
             # of seed, kind and size alone, so that a lane is the same in whatever mix it stands
-            rng = np.random.default_rng([c.seed, zlib.crc32(kind.encode()), round(1e4 * size)])
+            drawn_by = [seeds[level], zlib.crc32(kind.encode()), round(1e4 * size)]
+            rng = np.random.default_rng(drawn_by)
             heights[level, :, k] = KINDS[kind].heights(c, float(size), n.shape, rng)
             if heights[level, : columns(START, c), k].any():
                 raise ConfigError(f"'{kind}' must leave {START} m of level ground at its start")
@@ -199,11 +213,11 @@ def _numbers_of(c: config.Terrain, kind: str) -> _Numbers:
     """Return the numbers of one kind, from the terrain's own file or from that which defines it."""
     if kind not in KINDS:
         raise _unknown("kind", kind, KINDS)
-    for name in [c.name, "mixed"]:
+    for name in [c.name, "mixed", "flight"]:
         numbers = {} if Path(name).suffix in (".npy", ".png") else _numbers(name)
         if kind in numbers:
             return numbers[kind]
-    raise ConfigError(f"neither '{c.name}' nor 'mixed' has the kind '{kind}'")
+    raise ConfigError(f"neither '{c.name}' nor 'mixed' nor 'flight' has the kind '{kind}'")
 
 
 def _kinds(table: dict[str, Any], where: str) -> dict[str, _Numbers]:

@@ -29,7 +29,7 @@ from rich.progress import track
 from cref_jax import evaluation, exported, ood, ood_verdict, robot, scene, stand_in
 from cref_jax.config import Config, ConfigError
 from cref_jax.disturbance import UNDISTURBED, Disturbance
-from cref_jax.evaluation import COMMANDS, CROSSING_SECONDS
+from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
 from cref_jax.ood import Scene
 from cref_jax.ood_verdict import Condition, Outcome, Verdict
 from cref_jax.stand_in import StandIn, Start, Trial
@@ -65,7 +65,7 @@ def judge(
     trials: int = 10,
     stress_trials: int = 2,
     seed: int = 0,
-    seconds: float = CROSSING_SECONDS,
+    seconds: float = TRIAL_SECONDS,
     scenes: Mapping[str, Scene] | None = None,
     workers: int | None = None,
 ) -> Verdict:
@@ -121,7 +121,7 @@ def film(
     if out.suffix != ".mp4":
         raise ConfigError(f"a film must end in .mp4: {out}")
     ground = ood.named(name)
-    runner = _Runner(policy or exported.bundled(), {name: ground}, seed, CROSSING_SECONDS)
+    runner = _Runner(policy or exported.bundled(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
     physics = runner.config.physics
     spec = scene.stage("all", physics, -ood.DITCH - scene.BASE)

@@ -119,7 +119,7 @@ def verdict(
 
 def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneResult:
     """Return what the undisturbed trials in one scene come to."""
-    low, high = wilson(successes(outcomes), len(outcomes))
+    _, low, high = wilson(successes(outcomes), len(outcomes))
     seconds = [o.seconds for o in outcomes if o.ending == "finished"]
     return SceneResult(
         scene=name,
@@ -137,7 +137,7 @@ def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneRes
 def condition_result(condition: Condition, by_scene: dict[str, list[Outcome]]) -> ConditionResult:
     """Return what the trials in all scenes under one condition come to."""
     every = [outcome for outcomes in by_scene.values() for outcome in outcomes]
-    low, high = wilson(successes(every), len(every))
+    _, low, high = wilson(successes(every), len(every))
     said = Counter(flag.name for o in every for flag in Status if flag & o.status)
     return ConditionResult(
         condition=condition.name,

@@ -216,15 +216,20 @@ TERMS: dict[str, Term] = {
     )
 }
 
+EVENTS = ("foothold_placement", "feet_air_time")  # are not 0 in the step of a touchdown alone
+
 
 def total(
     s: Snapshot, c: config.Reward, robot: Robot
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the step's reward, and each weighted term under its name for the log.
 
-    The sum is scaled by the control period and cut at 0 from below as the configuration says.
+    The sum is scaled by the control period, touchdowns by their own time instead, and cut at 0 from
+    below, as the configuration says.
     """
     parts = {name: getattr(c.weights, name) * term(s, c, robot) for name, term in TERMS.items()}
+    if c.times_dt:
+        parts |= {name: parts[name] * c.event_time / s.control_period for name in EVENTS}
     reward = sum(parts.values(), start=jnp.zeros(()))
     if c.times_dt:
         reward = reward * s.control_period

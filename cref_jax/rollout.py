@@ -11,7 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float16, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
 from cref_jax import config, depth, env, episode, network, ppo
 from cref_jax.env import Outcome
@@ -116,7 +116,13 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
     state = jax.vmap(episode.reset, in_axes=(None, 0, 0, 0))(world, split(key_reset), kinds, levels)
     longest = round(c.episode.length / c.physics.control_period)
     state = state.replace(step=jax.random.randint(key_step, (num_envs,), 0, longest))
-    seen = jax.vmap(env.observe, in_axes=(None, 0, 0))(world, state, split(key_see))
+    return placed(world, state, split(key_see))
+
+
+def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
+    """Return the robots in these states, with nothing seen or remembered; a key for each."""
+    c, num_envs = world.config, state.kind.shape[0]
+    seen = jax.vmap(env.observe, in_axes=(None, 0, 0))(world, state, keys)
     sees = c.network.variant != "blind"
     return Robots(
         env=state,

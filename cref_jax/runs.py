@@ -16,7 +16,7 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -36,6 +36,11 @@ class Policy(NamedTuple):
     train: ppo.TrainState
     iteration: int
     run: Path
+
+    @property
+    def samples(self) -> int:
+        """Control steps of experience that it has learned from."""
+        return self.iteration * self.config.run.num_envs * self.config.ppo.horizon
 
 
 def composed(terrain: str, experiment: str | None, device: str) -> Config:
@@ -60,20 +65,34 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path) -> None:
-    """Add a line with what this start of the run is made by: versions, device, command, git."""
-    packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+def write_origin(run: Path, iteration: int = 0) -> None:
+    """Add a line with what this start of the run is made by: versions, device, command, git.
+
+    `iteration` is how many are done before it.
+    """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "iteration": iteration,
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
-        "device": f"{jax.device_count()} x {jax.devices()[0].device_kind}",
-        "cores": os.cpu_count(),
+        **machine(),
         "git": _git_state(),
-        **{name: importlib.metadata.version(name) for name in packages},
+        **versions(),
     }
     with (run / "origin.jsonl").open("a") as file:
         file.write(json.dumps(line) + "\n")
+
+
+def machine() -> dict[str, Any]:
+    """Return what this program runs on."""
+    kind = jax.devices()[0].device_kind
+    return {"device": f"{jax.device_count()} x {kind}", "cores": os.cpu_count()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that a result may depend on."""
+    packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    return {name: importlib.metadata.version(name) for name in packages}
 
 
 def data_folder(name: str) -> Path:

@@ -1,8 +1,8 @@
 """What lies in a lane: level ground, and on it noise, ramps, steps, trenches or boxes.
 
 Each function draws one kind of lane, as wide and as long as `config.Terrain` says, from physical
-sizes in metres, never from a difficulty. A lane begins and ends with level ground at z = 0, leads
-along +x, and what stands or lies in it spans its whole width.
+sizes in metres, never from a difficulty. A lane begins with level ground at z = 0, ends with level
+ground, leads along +x, and what stands or lies in it spans its whole width.
 """
 
 from collections.abc import Callable
@@ -49,6 +49,14 @@ class Stairs:
     tread: tuple[float, ...]  # m, one of these for the whole lane
     steps: tuple[int, int]  # of a flight, from, to; fewer where the lane is too short
     landing: float  # m
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Numbers of one flight."""
+
+    tread: float  # m
+    steps: tuple[int, int]  # from, to
 
 
 @dataclass(frozen=True)
@@ -116,6 +124,20 @@ def stairs_down(c: config.Terrain, size: float, shape: Stairs, rng: np.random.Ge
     return -stairs_up(c, size, shape, rng)
 
 
+def ascent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Generator) -> Heights:
+    """Return one flight of steps up, each rising `size` metres, and the level above it."""
+    steps = rng.integers(shape.steps[0], shape.steps[1] + 1)
+    start = START + rng.uniform(0.0, 0.5)  # assumed: not always the same
+    flight = [(start, 0.0), *((shape.tread, size * k) for k in range(1, steps))]
+    _check_length(c, _length(flight) + END)
+    return _across(c, flight, last=size * steps)
+
+
+def descent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Generator) -> Heights:
+    """Return one flight of steps down, and the level below it."""
+    return -ascent(c, size, shape, rng)
+
+
 def gap(c: config.Terrain, size: float, shape: Gap, rng: np.random.Generator) -> Heights:
     """Return level ground cut by equal trenches, `size` metres wide."""
     sections = []
@@ -150,6 +172,8 @@ KINDS: dict[str, Kind] = {
     "slope": Kind(slope, Slope),
     "stairs_up": Kind(stairs_up, Stairs),
     "stairs_down": Kind(stairs_down, Stairs),
+    "ascent": Kind(ascent, Flight),
+    "descent": Kind(descent, Flight),
     "gap": Kind(gap, Gap),
     "platform": Kind(platform, Platform),
 }
@@ -166,11 +190,12 @@ def _centres(c: config.Terrain) -> tuple[np.ndarray, np.ndarray]:
     return middles(c.lane_length), middles(c.lane_width)
 
 
-def _across(c: config.Terrain, sections: list[tuple[float, float]]) -> Heights:
-    """Return the lane made of (length, height) sections from the start on, then level at z = 0."""
+def _across(c: config.Terrain, sections: list[tuple[float, float]], last: float = 0.0) -> Heights:
+    """Return the lane made of (length, height) sections from the start on, then level at `last`."""
     profile = np.concatenate([np.full(columns(length, c), z) for length, z in sections])
     _check_length(c, profile.size * c.cell)
-    profile = np.pad(profile, (0, columns(c.lane_length, c) - profile.size))
+    rest = columns(c.lane_length, c) - profile.size
+    profile = np.pad(profile, (0, rest), constant_values=last)
     return np.repeat(profile[:, None], columns(c.lane_width, c), axis=1).astype(np.float32)
 
 

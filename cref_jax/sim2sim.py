@@ -22,7 +22,7 @@ from rich.progress import track
 from cref_jax import cli, evaluation, exported, runs, scene, stand_in
 from cref_jax.config import ConfigError
 from cref_jax.disturbance import Disturbance
-from cref_jax.evaluation import CROSSING_SECONDS, Crossing
+from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.world import World
 
@@ -100,7 +100,7 @@ def walked(world: World, path: Path, options: Options) -> list[Trial]:
     late = Disturbance(latency=max(0, round(options.latency / c.physics.control_period)))
 
     def one(start: Start) -> Trial:
-        return stand_in.run(body, deploy.Policy(*contents), start, CROSSING_SECONDS, late)
+        return stand_in.run(body, deploy.Policy(*contents), start, TRIAL_SECONDS, late)
 
     begun = starts(world, options.seed, options.trials)
     pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())

@@ -128,7 +128,7 @@ def train(options: Options, c: Config) -> None:
         with runs.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
             runs.write_config(run, c)
-            runs.write_origin(run)
+            runs.write_origin(run, first)
             samples = c.run.num_envs * c.ppo.horizon
             with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
                 report.say(_headline(run, c, options, first))

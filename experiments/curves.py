@@ -1,6 +1,5 @@
 """Draw the learning curves of runs: `python experiments/curves.py runs/A runs/B --out flat.png`."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +8,9 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-import numpy as np
 import tyro
+
+from cref_jax import curves
 
 SMOOTH = 10  # iterations that a point is the mean of
 SHOWN = {
@@ -36,14 +36,11 @@ def main() -> None:
     options = tyro.cli(Options)
     figure, axes = plt.subplots(1, len(SHOWN), figsize=(4 * len(SHOWN), 3), constrained_layout=True)
     for run in options.runs:
-        rows = [json.loads(line) for line in (run / "log.jsonl").open()]
-        samples = np.array([row["train/samples"] for row in rows])
-        rate = np.array([row["samples_per_s"] for row in rows])
-        minutes = np.cumsum(np.diff(samples, prepend=0.0) / rate) / 60.0
+        log = curves.read(run / "log.jsonl")
+        label = f"{run.name}, {log['train/samples'][-1] / 1e6:.1f} M"
         for axis, name in zip(axes, SHOWN, strict=True):
-            values = np.array([row[name] for row in rows])
-            mean = np.convolve(values, np.ones(SMOOTH) / SMOOTH, mode="valid")
-            axis.plot(minutes[SMOOTH - 1 :], mean, label=f"{run.name}, {samples[-1] / 1e6:.1f} M")
+            mean = curves.smooth(log, name, SMOOTH)
+            axis.plot(log.minutes()[SMOOTH - 1 :], mean[SMOOTH - 1 :], label=label)
     for axis, title in zip(axes, SHOWN.values(), strict=True):
         axis.set_title(title, fontsize=10)
         axis.set_xlabel("minutes")

@@ -261,7 +261,7 @@ def test_only_an_end_without_a_failure_truncates(cause):
         (4.4, 9.0, 1, "timeout", 0),  # less than half of it
         (0.1, 9.0, 0, "tilted", 0),  # never below the easiest
         (11.0, 9.0, 1, "tilted", 1),  # far, but fell
-        (1.0, 0.5, 1, "tilted", 1),  # fell early, but had done what was asked
+        (1.0, 1.0, 1, "tilted", 0),  # fell early, in the first metre of the 9 to come
         (3.0, 9.0, 1, "finished", 2),  # reached the end, however long the lane was
     ],
 )
@@ -270,11 +270,25 @@ def test_a_rank_is_won_and_lost(world, robots, walked, commanded, level, cause, 
     assert int(rank) == int(next_level) == expected
 
 
+def test_no_more_is_asked_for_than_the_lane_is_long(world, robots):
+    # 1 m/s for 20 s is 20 m, the way from 0.75 m to the finish at 11 m is 10.25 m
+    state = one(robots).replace(command=jnp.array([1.0, 0.0, 0.0]), start=jnp.array([0.75, 0.0]))
+    assert float(episode._asked(world, state)) == pytest.approx(10.25)
+    slow = state.replace(command=jnp.array([0.3, 0.4, 0.0]), step=jnp.int32(500))
+    assert float(episode._asked(world, slow)) == pytest.approx(5.0)  # 0.5 m/s for 10 s
+
+
 def after(world, robots, walked, commanded, level, rank, cause, review, key=0):
     """Return rank and next level of a robot that walked so far on a lane of this level."""
     c = config.override(C, {"curriculum": {"review": review}})
+    # at 0.5 m/s, so that the rest of the 20 s asks for what is left of 9 m
+    step = jnp.int32(round((20.0 - (9.0 - commanded) / 0.5) / 0.02))
     state = one(robots).replace(
-        level=jnp.int32(level), rank=jnp.int32(rank), commanded=jnp.float32(commanded)
+        level=jnp.int32(level),
+        rank=jnp.int32(rank),
+        commanded=jnp.float32(commanded),
+        command=jnp.array([0.5, 0.0, 0.0]),
+        step=step,
     )
     state = put(state, x=state.start[0] + walked)
     over = Ending(*(jnp.array(name == cause) for name in Ending._fields))

@@ -21,6 +21,7 @@ TRAIN = {  # m, Table II where it has the kind
     "gap": (0.10, 0.75),
     "platform": (0.05, 0.40),
 }
+FLIGHTS = {"ascent": (0.05, 0.20), "descent": (0.05, 0.20)}
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +124,27 @@ def test_stairs_down_go_below_the_start_first():
 
 
 @pytest.mark.parametrize("seed", range(12))
+def test_a_flight_rises_evenly_and_stays_above(seed):
+    stretches = runs(single("ascent", 0.23, seed=seed))
+    heights, lengths = np.array(stretches).T
+    steps = len(stretches) - 1
+    assert 8 <= steps <= 14
+    np.testing.assert_allclose(heights, 0.23 * np.arange(steps + 1), atol=1e-6)
+    np.testing.assert_allclose(lengths[1:-1], 0.30)
+    assert 1.5 <= lengths[0] <= 2.0 + CELL and lengths[-1] >= 1.0
+    np.testing.assert_array_equal(single("descent", 0.23, seed=seed).max(), 0.0)
+
+
+def test_a_grid_has_each_size_with_each_seed():
+    c = config.Terrain()
+    atlas = lanes.grid(c, {"gap": (0.3, 0.5), "platform": (0.2, 0.4)}, [7, 8, 9])
+    assert atlas.levels == 6 and atlas.kinds == ("gap", "platform")
+    np.testing.assert_array_equal(atlas.sizes[:, 1], [0.2, 0.2, 0.2, 0.4, 0.4, 0.4])
+    for level, (size, seed) in {1: (0.3, 8), 3: (0.5, 7), 5: (0.5, 9)}.items():
+        np.testing.assert_array_equal(profile(atlas, level), single("gap", size, seed=seed))
+
+
+@pytest.mark.parametrize("seed", range(12))
 def test_platforms_are_two_or_three_boxes_of_the_height_asked_for(seed):
     stretches = runs(single("platform", 0.43, seed=seed))
     boxes = [(height, length) for height, length in stretches if height > 0.0]
@@ -169,7 +191,7 @@ def test_evaluation_sizes_are_those_of_table_2():
 @pytest.mark.parametrize("path", sorted(lanes.directory().glob("*.toml")), ids=lambda p: p.stem)
 def test_every_terrain_file_builds(path):
     small = config.Terrain(name=path.stem, lane_width=1.0, levels=1)
-    assert lanes.build(small).sizes[0, 0] == TRAIN[lanes.build(small).kinds[0]][0]
+    assert lanes.build(small).sizes[0, 0] == (TRAIN | FLIGHTS)[lanes.build(small).kinds[0]][0]
 
 
 # A user's own ground
@@ -229,7 +251,7 @@ def refused(message, call, *args):
 
 
 def test_an_unknown_terrain_is_met_with_the_nearest_name():
-    known = "flat, gap, mixed, platform, rough, slope, stairs"
+    known = "flat, flight, gap, mixed, platform, rough, slope, stairs"
     message = f"unknown terrain 'gpa'; did you mean 'gap'? known: {known}"
     refused(message, lanes.build, config.Terrain(name="gpa"))
 

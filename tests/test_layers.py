@@ -12,18 +12,29 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "deploy", "leaves", "layers", "stall", "disturbance", "proportion"},
-    {"terrain", "shapes", "robot", "host_call", "film"},
-    {"kinematics", "lanes", "host_physics"},
-    {"physics", "depth", "foothold"},
+    {
+        "config",
+        "geometry",
+        "deploy",
+        "leaves",
+        "layers",
+        "paper",
+        "proportion",
+        "stall",
+        "disturbance",
+    },
+    {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
+    {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
+    {"physics", "depth", "foothold", "evaluation_page"},
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
-    {"rollout", "checkpoint", "distill", "brax_env"},
+    {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
+    {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in", "ood", "ood_verdict"},
+    {"runs", "peers", "stand_in", "table", "run_page", "ood", "ood_verdict"},
     {"exported"},
-    {"ood_suite"},
+    {"watch", "ood_suite"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}

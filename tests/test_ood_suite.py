@@ -173,7 +173,7 @@ def test_a_film_is_an_mp4(tmp_path):
 @pytest.mark.slow
 def test_a_trial_can_be_filmed(tmp_path, monkeypatch):
     monkeypatch.setattr(ood_suite, "SIZE", (64, 48))
-    monkeypatch.setattr(ood_suite, "CROSSING_SECONDS", 0.2)
+    monkeypatch.setattr(ood_suite, "TRIAL_SECONDS", 0.2)
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     try:
         scene.Canvas(model, 8, 8).__exit__()

@@ -1,0 +1,87 @@
+"""The paper's own figures (Sec. III), to stand beside ours, and how its derived ones are made.
+
+Success is in percent of `TRIALS` trials a cell, sizes are in terrains/*.toml.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+TRIALS = 2000  # a cell; of stairs one half goes up and one half down
+KINDS = ("stairs", "gap", "platform")
+LEVELS = ("easy", "medium", "hard", "ood")  # the last one is outside of training
+ROUNDING = 0.01  # points; a printed value that is further off is no rounding
+
+Cell = tuple[str, str]  # kind, level
+
+
+class Method(NamedTuple):
+    """A row of Table II and of Table III."""
+
+    success: dict[Cell, float]  # %, Table II
+    up: dict[str, int]  # failures on the way up at each level, Table III
+    down: dict[str, int]  # failures on the way down at each level, Table III
+    scenes: int  # of 20 in MuJoCo, Table II
+    overall: float  # %, as printed in Table II
+
+
+def _method(
+    success: tuple[float, ...], failures: tuple[int, ...], scenes: int, overall: float
+) -> Method:
+    cells = [(kind, level) for kind in KINDS for level in LEVELS]
+    return Method(
+        success=dict(zip(cells, success, strict=True)),
+        up=dict(zip(LEVELS, failures[0::2], strict=True)),
+        down=dict(zip(LEVELS, failures[1::2], strict=True)),
+        scenes=scenes,
+        overall=overall,
+    )
+
+
+FULL = "Full CReF"
+METHODS = {
+    FULL: _method(
+        (99.85, 99.75, 97.25, 73.45, 99.30, 98.35, 92.15, 44.70, 99.65, 99.35, 97.35, 84.35),
+        (1, 2, 2, 3, 3, 52, 93, 438), 20, 90.45,
+    ),
+    "w/o Cross-Attn": _method(
+        (96.25, 87.50, 78.70, 34.00, 97.10, 97.70, 83.00, 8.60, 99.40, 98.75, 96.90, 64.80),
+        (0, 75, 47, 203, 88, 338, 496, 824), 19, 78.56,
+    ),
+    "w/o GRF": _method(
+        (99.60, 93.40, 83.60, 49.10, 98.00, 98.25, 90.05, 29.95, 99.45, 99.15, 96.20, 68.55),
+        (2, 6, 25, 107, 39, 289, 128, 890), 19, 83.78,
+    ),
+    "w/o Highway Gate": _method(
+        (97.65, 98.40, 93.65, 50.20, 98.50, 96.90, 86.35, 17.20, 98.45, 97.65, 91.45, 73.10),
+        (13, 34, 3, 29, 39, 88, 293, 703), 20, 83.29,
+    ),
+    "HPL": _method(
+        (95.45, 81.45, 71.05, 27.40, 97.45, 94.40, 78.25, 20.85, 98.05, 92.65, 81.80, 55.15),
+        (29, 62, 136, 235, 241, 338, 493, 959), 1, 74.57,
+    ),
+}  # fmt: skip
+
+
+def overall(success: Mapping[Cell, float]) -> float:
+    """Return the plain mean of the twelve cells, those outside of training included."""
+    return sum(success[kind, level] for kind in KINDS for level in LEVELS) / 12.0
+
+
+def stair_success(up: int, down: int, trials: int = TRIALS) -> float:
+    """Return the success on stairs, %, from the failures on the way up and on the way down."""
+    return 100.0 * (1.0 - (up + down) / trials)
+
+
+def misprints() -> dict[str, tuple[float, float]]:
+    """Return the derived values that are printed otherwise: (printed, recomputed), %."""
+    found = {}
+    for name, method in METHODS.items():
+        derived = {f"{name}, overall": (method.overall, overall(method.success))}
+        for level in LEVELS:
+            derived[f"{name}, stairs, {level}"] = (
+                method.success["stairs", level],
+                stair_success(method.up[level], method.down[level]),
+            )
+        wrong = lambda pair: abs(pair[0] - pair[1]) > ROUNDING
+        found |= {title: pair for title, pair in derived.items() if wrong(pair)}
+    return found

@@ -1,0 +1,121 @@
+"""Gather what is known about a run into one page: `python -m cref_jax.report --run runs/NAME`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cref_jax import deploy  # before numpy, whose number of threads it sets
+
+# isort: split
+
+import tyro
+
+from cref_jax import cli, exported, page, run_page
+from cref_jax.config import ConfigError
+from cref_jax.page import Column, Html, Section, code, join
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write one self-contained page about a run or an exported policy."""
+
+    run: Path | None = None
+    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
+    policy: Path | None = None
+    """an exported policy instead of a run"""
+    out: Path | None = None
+    """the page, .html; report.html in the folder of the run when left out, or policy.html here"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.report")
+    with cli.one_line_errors(options.debug):
+        if options.out:
+            page.check_name(options.out)
+        source = exported.chosen(options.run, options.policy)
+        if options.policy or (options.run is None and not exported.is_run(source)):
+            out, document = options.out or Path("policy.html"), _policy_document(source)
+        else:
+            out = options.out or source / "report.html"
+            document = run_page.document(run_page.read(source))
+        page.write(out, document)
+        print(f"wrote {out}, {out.stat().st_size / 1000:,.0f} kB; open it in any browser")
+
+
+def _policy_document(path: Path) -> str:
+    """Return the page of an exported policy.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        content, _ = deploy.contents(path)
+    except deploy.PolicyFormatError as error:
+        raise ConfigError(str(error)) from None
+    origin = content["provenance"]
+    record = content.get("evaluation")
+    sections = [
+        Section("What it is", _overview(content, path)),
+        Section("Joints", _joints(content)),
+        Section("Where it comes from", run_page.provenance((origin["trained_by"],))),
+        Section("Settings", run_page.settings(origin["config"])),
+        Section("Evaluation", run_page.evaluation(record, "manifest.json"))
+        if record
+        else Section("Evaluation", page.note("None was there when it was exported.")),
+    ]
+    lead = page.tiles(
+        [
+            (f"{origin['iteration']:,}", "iterations"),
+            (f"{origin['samples'] / 1e6:.1f} M", "samples"),
+            (content["network"]["variant"], "network"),
+        ]
+    )
+    return page.document(f"Policy {path.resolve().name}", lead, sections, run_page.foot())
+
+
+def _overview(content: dict[str, Any], path: Path) -> Html:
+    """Return what an exported policy takes and where it is from."""
+    origin, rates, command = content["provenance"], content["rates"], content["command"]
+    ends = zip(command["low"], command["high"], strict=True)
+    limits = [f"{low:g} to {high:g}" for low, high in ends]
+    return page.pairs(
+        [
+            ("folder", code(str(path))),
+            ("run", str(origin["run"])),
+            ("exported", run_page.moment(origin["exported"])),
+            ("control", f"{rates['control_hz']:g} Hz"),
+            ("depth", f"{rates['depth_hz']:g} Hz" if content.get("depth") else "none: it is blind"),
+            ("command forward", f"{limits[0]} m/s"),
+            ("command to the left", f"{limits[1]} m/s"),
+            ("command of the yaw rate", f"{limits[2]} rad/s"),
+            ("digest", code(str(content["digest"]))),
+        ]
+    )
+
+
+def _joints(content: dict[str, Any]) -> Html:
+    """Return the joints that the policy drives, and those that the robot has to hold."""
+    keys = ("default_rad", "low_rad", "high_rad", "kp", "kd", "effort_nm")
+    titles = (
+        "default, rad",
+        "low, rad",
+        "high, rad",
+        "kp, N m/rad",
+        "kd, N m s/rad",
+        "effort, N m",
+    )
+    columns = [Column("joint"), *(Column(title, True) for title in titles)]
+    number = lambda joint, key: f"{joint[key]:.4g}" if key in joint else page.MISSING
+    rows = lambda joints: [(j["name"], *(number(j, key) for key in keys)) for j in joints]
+    driven, held = content["joints"], content["held_joints"]
+    return join(
+        page.folded(f"{len(driven)} joints that it drives", page.table(columns, rows(driven))),
+        page.folded(f"{len(held)} joints that the robot holds", page.table(columns, rows(held))),
+    )
+
+
+if __name__ == "__main__":
+    main()

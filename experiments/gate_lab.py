@@ -1,0 +1,297 @@
+"""When the policy leans on its memory (Sec. III-B): `python experiments/gate_lab.py`.
+
+Writes gate.png and gate.csv: the highway gate beta of Eq. 16, its mean over the channels, grouped
+by what the robot walks on, by how its feet touch the ground, and by its posture; and one robot's
+gate over time. Near 1 the action leans on memory, near 0 on what is sensed now. 140 robots take two
+minutes on 4 busy cores, 40 s of which are compilation.
+
+Robots walk lanes of every kind at their medium size (Table II) at one command. Terrain: the lane of
+that name, from 0.5 m before its first obstacle to the end of its last; a flight of stairs counts by
+its direction. Phase: flight, no foot touches; single and double support. Posture: risky, |roll| or
+|pitch| above 0.20 rad; stable, the rest. Phase and posture are those of every step on every lane.
+Not counted: the first second, when the memory fills, and what follows a robot's end.
+
+The paper finds higher gates on stairs than on flat ground, in flight than in support, and in risky
+than in stable postures. n counts robots' steps of 20 ms, which are far from independent.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from jaxtyping import Array, Bool, Float, Int, Shaped
+from matplotlib.axes import Axes
+
+from cref_jax import cli, profile, watch
+from cref_jax.config import Config, ConfigError
+from cref_jax.physics import EngineName
+from cref_jax.terrain import Terrain
+from cref_jax.watch import Moment, Watched
+from cref_jax.world import World
+
+RISKY = 0.20  # rad, |roll| or |pitch| above it, Sec. III-B
+WARM_UP = 1.0  # s; assumed: the memory is empty at first and the robot stands
+FEW = 100  # steps; a group of fewer is marked
+GROUPS = {
+    "terrain": ("flat", "stairs up", "stairs down", "gap", "platform", "rough", "slope"),
+    "phase": ("flight", "single support", "double support"),
+    "posture": ("stable", "risky"),
+}
+COLUMNS = ("group", "state", "n", "robots", "mean", "q25", "median", "q75", "note")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Group the highway gate of a policy by terrain, contact phase and posture."""
+
+    run: Path | None = None
+    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
+    policy: Path | None = None
+    """an exported policy (a directory or .zip) instead of a run"""
+    kind: str | None = None
+    """of the lane that one robot is traced on; when left out, of the policy's own terrain"""
+    command: float = 0.6
+    """m/s forward"""
+    seconds: float = 20.0
+    """length of a trial"""
+    num_envs: int | None = None
+    """robots; 64 on a CPU, 4096 on an accelerator when left out"""
+    seed: int = 0
+    """of the first states"""
+    engine: EngineName = "auto"
+    """mujoco steps on the CPU, mjx on the device"""
+    out: Path = Path("gate.png")
+    """the picture to write; the table stands beside it"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class Step(NamedTuple):
+    """What is kept of a control step of E robots, before it: what the gate was worked out for."""
+
+    gate: Float[Array, "E 3"]  # of the channels: mean, 10th and 90th percentile
+    airborne: Bool[Array, "E F"]
+    pose: Float[Array, "E 7"]  # of the base: m, quaternion
+
+
+class Row(NamedTuple):
+    """The gate in one state."""
+
+    group: str
+    state: str
+    n: int  # steps of all robots
+    robots: int
+    mean: float
+    q25: float
+    median: float
+    q75: float
+
+    @property
+    def note(self) -> str:
+        """What a reader of the numbers must know."""
+        return f"n below {FEW}" if self.n < FEW else ""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    options = tyro.cli(Options, args=arguments)
+    with cli.one_line_errors(options.debug):
+        cli.prepare()
+        out = watch.picture(options.out)
+        policy, world = watch.opened(options.run, options.policy, options.engine)
+        c = policy.config
+        check(c)
+        kind = watch.kind_of_lane(c, options.kind)
+        world = watch.placed(c, world, watch.medium(c), options.command)
+        count = watch.crowd(options.num_envs, on_accelerator=4096)
+        robots = watch.begin(world, options.seed, count)
+        steps = watch.steps_of(options.seconds, c)
+        watched = watch.watch(world, policy.train, robots, steps, look)
+        found = list(rows(world, watched))
+        watch.write_table(
+            out.with_suffix(".csv"), COLUMNS, ((*row, row.note) for row in found if row.n)
+        )
+        draw(out, found, world, watched, kind)
+        for row in found:
+            print(line(row))
+        print(f"wrote {out} and {out.with_suffix('.csv')}")
+
+
+def check(c: Config) -> None:
+    """Refuse a policy without a gate; say what that of a blind one blends.
+
+    Raises:
+        ConfigError: the policy has no gate.
+    """
+    if c.network.variant == "no_highway":
+        raise ConfigError("this policy has no gate: its variant is 'no_highway'; take any other")
+    if c.network.variant == "blind":
+        print("a blind policy: its gate blends memory with proprioception, no depth")
+
+
+def look(world: World, moment: Moment) -> Step:
+    """Return the gate, and the state that it was worked out for."""
+    state, gate = moment.robots.env, moment.policy.gate[0]
+    low, high = jnp.percentile(gate, jnp.array([10.0, 90.0]), axis=1)
+    return Step(
+        gate=jnp.stack([gate.mean(axis=1), low, high], axis=1),
+        airborne=state.air_time > 0.0,
+        pose=state.body.qpos[:, :7],
+    )
+
+
+def rows(world: World, watched: Watched) -> Iterator[Row]:
+    """Yield the gate in each state of each group."""
+    seen = watched.seen
+    counted = watched.alive.copy()
+    counted[: round(WARM_UP / world.config.physics.control_period)] = False
+    states = {
+        "terrain": watch.terrain_under(world.lanes, seen.pose[..., 0]),
+        "phase": phases(seen.airborne),
+        "posture": postures(seen.pose[..., 3:]),
+    }
+    for group, names in GROUPS.items():
+        for name in names:
+            yield summary(group, name, seen.gate[..., 0], counted & (states[group] == name))
+
+
+def summary(
+    group: str, state: str, gate: Float[np.ndarray, "T E"], where: Bool[np.ndarray, "T E"]
+) -> Row:
+    """Return the gate of the steps of one state; NaN where there are none."""
+    x = gate[where].astype(np.float64)
+    quartiles = np.percentile(x, (25, 50, 75)) if x.size else np.full(3, np.nan)
+    mean = float(x.mean()) if x.size else float("nan")
+    return Row(group, state, x.size, int(where.any(axis=0).sum()), mean, *map(float, quartiles))
+
+
+def phases(airborne: Bool[np.ndarray, "*n F"]) -> Shaped[np.ndarray, "*n"]:
+    """Return how many feet touch the ground, in words."""
+    return np.array(["double support", "single support", "flight"])[airborne.sum(axis=-1)]
+
+
+def postures(rotation: Float[np.ndarray, "*n 4"]) -> Shaped[np.ndarray, "*n"]:
+    """Return whether the base is tilted by more than RISKY in roll or pitch."""
+    w, x, y, z = np.moveaxis(rotation, -1, 0)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    return np.where((np.abs(roll) > RISKY) | (np.abs(pitch) > RISKY), "risky", "stable")
+
+
+def line(row: Row) -> str:
+    """Return one state in one line for people."""
+    said = f"{row.group:8} {row.state:15} n {row.n:7d} of {row.robots:4d} robots"
+    if not row.n:
+        return f"{said}: never"
+    said += f": mean {row.mean:.3f}, quartiles {row.q25:.3f} {row.median:.3f} {row.q75:.3f}"
+    return said + (f" ({row.note})" if row.note else "")
+
+
+def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str) -> None:
+    """Draw the groups, and one robot's gate over the ground that it walked on."""
+    figure = plt.figure(figsize=(12, 5), constrained_layout=True)
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.5), height_ratios=(4.0, 0.7, 2.0))
+    draw_groups(figure.add_subplot(grid[:, 0]), found)
+    gate = figure.add_subplot(grid[0, 1])
+    feet, ground = (figure.add_subplot(grid[row, 1], sharex=gate) for row in (1, 2))
+    k = world.lanes.kinds.index(kind)
+    t, best = furthest(world, watched, k)
+    if t.size:
+        time = t * world.config.physics.control_period
+        draw_gate(gate, time, watched.seen.gate[t, best])
+        draw_feet(feet, time, ~watched.seen.airborne[t, best])
+        _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
+        lane = world.lanes.tile(levels[best], k)
+        under = draw_ground(ground, time, lane, watched.seen.pose[t, best, 0])
+        for at in time[1:][np.diff(under) != 0.0]:
+            gate.axvline(at, color="0.8", lw=0.8, zorder=0)
+        for axis in (gate, feet):
+            axis.tick_params(labelbottom=False)
+        gate.set_title(
+            f"{watch.name_of_lane(world, kind)}: the robot that came furthest", fontsize=9
+        )
+    else:
+        gate.set_title(f"no robot on {kind}", fontsize=9)
+    figure.savefig(out, dpi=90)
+
+
+def furthest(world: World, watched: Watched, kind: int) -> tuple[Int[np.ndarray, " t"], int]:
+    """Return the steps and the number of the robot that came furthest on a lane."""
+    x = np.where(watched.alive, watched.seen.pose[..., 0], -np.inf)
+    x[:, watch.in_turn(world.lanes, x.shape[1])[0] != kind] = -np.inf
+    best = int(np.argmax(x.max(axis=0)))
+    return np.flatnonzero(np.isfinite(x[:, best])), best
+
+
+def draw_groups(axis: Axes, found: list[Row]) -> None:
+    """Draw mean and quartiles of each state, a colour a group."""
+    colours = dict(zip(GROUPS, ("C0", "C1", "C2"), strict=True))
+    labels, y = [], []
+    for k, row in enumerate(found):
+        at = k + 0.8 * list(GROUPS).index(row.group)
+        few = " !" if row.note and row.n else ""
+        y.append(at)
+        labels.append(f"{row.state}\nn = {row.n:,}{few}")
+        if row.n:
+            axis.barh(at, row.q75 - row.q25, 0.5, row.q25, color=colours[row.group], alpha=0.35)
+            axis.plot([row.median] * 2, [at - 0.25, at + 0.25], color=colours[row.group], lw=2)
+            axis.plot(row.mean, at, "o", color=colours[row.group], ms=5)
+    ends = [x for row in found if row.n for x in (row.q25, row.q75, row.mean)]
+    if ends:
+        margin = 0.05 * (max(ends) - min(ends)) + 1e-3
+        axis.set_xlim(min(ends) - margin, max(ends) + margin)
+    axis.set_yticks(y, labels, fontsize=8)
+    axis.invert_yaxis()
+    axis.grid(axis="x", alpha=0.3)
+    axis.set_xlabel("highway gate, mean of the channels (1: leans on memory)")
+    axis.set_title(f"dot: mean; line: median; bar: quartiles; !: n below {FEW} steps", fontsize=9)
+
+
+def draw_gate(axis: Axes, time: Float[np.ndarray, " t"], gate: Float[np.ndarray, "t 3"]) -> None:
+    """Draw the mean of the channels, and say how far apart they are."""
+    mean, low, high = gate.T
+    axis.plot(time, mean, color="C0", lw=1.2)
+    axis.set(ylabel="highway gate,\nmean of the channels")
+    axis.grid(axis="y", alpha=0.3)
+    said = f"80 % of the channels lie in {low.mean():.2f} to {high.mean():.2f}"
+    axis.text(0.99, 0.97, said, transform=axis.transAxes, ha="right", va="top", size=8)
+    axis.set_ylim(top=axis.get_ylim()[1] + 0.15 * np.ptp(axis.get_ylim()))
+
+
+def draw_feet(axis: Axes, time: Float[np.ndarray, " t"], down: Bool[np.ndarray, "t F"]) -> None:
+    """Draw when each foot touches the ground."""
+    for foot in range(2):
+        axis.fill_between(
+            time, 0.1 - foot, 0.9 - foot, where=down[:, foot], step="post", color="0.35", lw=0
+        )
+    axis.set_yticks([0.5, -0.5], ["left", "right"], fontsize=8)
+    axis.set(ylabel="foot on\nground", ylim=(-1, 1))
+
+
+def draw_ground(
+    axis: Axes,
+    time: Float[np.ndarray, " t"],
+    ground: Terrain,
+    x: Float[np.ndarray, " t"],
+) -> Float[np.ndarray, " t"]:
+    """Draw and return the height of the ground under the pelvis over time, m."""
+    heights = profile.along(ground)
+    under = heights[np.clip((x / ground.cell).astype(int), 0, len(heights) - 1)]
+    floor = min(float(under.min()), 0.0) - 0.1
+    axis.fill_between(time, floor, under, step="post", color="0.75", lw=0)
+    axis.set(xlabel="time, s", ylabel="ground under\nthe pelvis, m")
+    axis.set_ylim(floor, float(under.max()) + 0.15)
+    axis.grid(axis="y", alpha=0.3)
+    return under
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,226 @@
+"""Trials with known answers: walkers that fall, that are carried, that stand, that blow up."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cref_jax import config, evaluation, rollout, table, trials
+from cref_jax.config import Config
+from cref_jax.episode import Ending
+from cref_jax.physics import Physics
+from cref_jax.trials import ENDINGS, Trace
+
+C = config.override(
+    Config(),
+    {
+        "terrain": {"lane_length": 5.0, "lane_width": 1.0},
+        "episode": {"bank_size": 4},
+        "network": {"variant": "blind"},
+    },
+)
+PERIOD = C.physics.control_period
+HIGH = 3.0  # m, above every lane
+
+
+@pytest.fixture(scope="module")
+def physics():
+    return Physics(C.robot, C.physics, "mujoco", threads=2)
+
+
+@pytest.fixture(scope="module")
+def world(physics):
+    return evaluation.crossing_world(C, physics, "flat", 0.0)
+
+
+def walker(carry):
+    """Return what first moves the robots' bases, then steps them with no action."""
+
+    def step(world, robots):
+        body = robots.env.body
+        state = robots.env.replace(body=carry(robots.env, body))
+        return rollout.advance(
+            world, robots.replace(env=state), robots.memory, jnp.zeros_like(state.action)
+        )
+
+    return jax.tree_util.Partial(step)
+
+
+def held(env, body, x, z):
+    """Return the body upright and still at x, z."""
+    qpos = body.qpos.at[:, 0].set(x).at[:, 1].set(0.0).at[:, 2].set(z)
+    qpos = qpos.at[:, 3:7].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
+    return body._replace(qpos=qpos, qvel=jnp.zeros_like(body.qvel))
+
+
+carried = walker(
+    lambda env, body: held(env, body, body.qpos[:, 0] + env.command[:, 0] * PERIOD, HIGH)
+)
+stands = walker(lambda env, body: held(env, body, env.start[:, 0], HIGH))
+falls = walker(
+    lambda env, body: body._replace(
+        qpos=body.qpos.at[:, 3:7].set(jnp.array([0.5, 0.5, 0.5, 0.5])).at[:, 2].set(HIGH)
+    )
+)
+blows_up = walker(
+    lambda env, body: held(env, body, env.start[:, 0] + 3.5, HIGH)._replace(
+        qvel=jnp.full_like(body.qvel, jnp.inf)
+    )
+)
+
+
+def run(world, walker, count=4, block=4, seed=0):
+    return trials.run(world, walker, *evaluation.crossing_lanes(count), seed, block)
+
+
+def test_who_is_carried_along_the_lane_always_succeeds(world):
+    found = run(world, carried)
+    assert found.succeeded.all() and sum(found.failures().values()) == 0
+    # from 0.5 to 1 m, to the finish at 4 m
+    assert np.all(found.seconds > 3.0 / found.speed - 0.1)
+    assert np.all(found.seconds < 3.5 / found.speed + 0.1)
+    assert np.all((found.speed >= 0.4) & (found.speed <= 0.8))
+
+
+def test_who_always_falls_never_succeeds(world):
+    found = run(world, falls)
+    assert found.failures()["tilted"] == 4
+    np.testing.assert_allclose(found.seconds, PERIOD)
+
+
+def test_who_stands_still_fails_for_lack_of_progress(world):
+    found = run(world, stands)
+    assert found.failures()["stalled"] == 4
+    np.testing.assert_allclose(found.seconds, 10.0 + PERIOD)
+
+
+def test_who_blows_up_beyond_the_finish_has_failed(world):
+    assert run(world, blows_up).failures()["unstable"] == 4
+
+
+def test_a_trial_does_not_depend_on_how_many_there_are(world):
+    few, many = (run(world, carried, count, block=3) for count in (2, 5))
+    for a, b in zip(few, many, strict=True):
+        np.testing.assert_array_equal(a, b[:2])
+    assert len(set(many.speed.tolist())) == 5  # each has its own command
+    assert not np.array_equal(few.speed, run(world, carried, 2, block=3, seed=1).speed)
+
+
+def test_the_ends_are_told_as_they_come(world):
+    told = []
+    trials.run(world, carried, *evaluation.crossing_lanes(5), 0, 3, told.append)
+    assert sum(told) == 5 and max(told) < 5
+
+
+def trace(steps, robots=1, progress=0.01, **flags):
+    """Return robots that come `progress` m a step, with flags of Ending raised at a step."""
+    raised = np.zeros((steps, robots), bool)
+    ending = Ending(
+        *(
+            np.arange(steps)[:, None] == flags[name] if name in flags else raised
+            for name in Ending._fields
+        )
+    )
+    way = progress * np.arange(1, steps + 1)[:, None] * np.ones(robots)
+    return Trace(ending, way.astype(np.float32), np.full((steps, robots), 0.5, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("flags", "progress", "ending", "seconds"),
+    [
+        ({"finished": 99}, 0.01, "finished", 2.0),
+        ({"finished": 99, "timeout": 99}, 0.01, "finished", 2.0),
+        ({"finished": 99, "hit": 99}, 0.01, "hit", 2.0),  # falls over the line
+        ({"finished": 99, "hit": 100}, 0.01, "finished", 2.0),  # what comes later is another's
+        ({"finished": 99, "unstable": 50}, 0.01, "unstable", 1.02),
+        ({"tilted": 49, "low": 49}, 0.01, "tilted", 1.0),
+        ({"timeout": 599}, 0.01, "late", 12.0),
+        ({"finished": 599}, 0.0, "stalled", 10.02),  # it stood for 10 s first
+        ({"tilted": 500}, 0.0, "tilted", 10.02),  # it fell in that step
+        ({}, 0.01, "late", 12.0),
+    ],
+)
+def test_what_comes_first_decides(flags, progress, ending, seconds):
+    found = trials.judged(trace(600, progress=progress, **flags), np.array([0.5]), PERIOD)
+    assert ENDINGS[found.ending[0]] == ending
+    assert found.seconds[0] == pytest.approx(seconds)
+    assert found.forward[0] == pytest.approx(0.5)
+
+
+def test_stairs_are_tried_up_and_down_and_every_lane_in_turn(physics):
+    kinds = ("ascent", "descent", "gap", "platform")
+    up_down = table.lanes_of(("stairs", "hard"), 20, kinds)
+    np.testing.assert_array_equal(up_down.kind, [0, 1] * 10)
+    variants = len(evaluation.LANE_SEEDS)
+    assert variants == 5
+    np.testing.assert_array_equal(up_down.level[:12] - 10, [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0])
+    gap = table.lanes_of(("gap", "easy"), 6, kinds)
+    np.testing.assert_array_equal(gap.kind, 2)
+    np.testing.assert_array_equal(gap.level, [0, 1, 2, 3, 4, 0])
+
+
+def test_the_worlds_lanes_have_the_sizes_of_the_cells(physics):
+    world = table.world(C, physics)
+    kinds = world.lanes.kinds
+    for cell, kind in {("stairs", "medium"): "descent", ("platform", "ood"): "platform"}.items():
+        on = table.lanes_of(cell, 10, kinds)
+        sizes = world.lanes.sizes[on.level, kinds.index(kind)]
+        np.testing.assert_array_equal(sizes, table.sizes()[cell[0]][cell[1]])
+    assert all(world.lanes.is_profile)  # so that kinds may share a block: see rollout.exposed
+
+
+def made(successes, count, speed=0.45, cause="low"):
+    ending = np.full(count, ENDINGS.index(cause))
+    ending[:successes] = 0
+    return trials.Trials(
+        np.full(count, speed, np.float32), ending, np.ones(count), np.ones(count, np.float32)
+    )
+
+
+def outcomes(successes, count, **how):
+    """Return the same outcome in every cell; the second half of stairs goes down."""
+    down = np.arange(count) >= count // 2
+    return {
+        cell: table.Outcomes(made(successes, count, **how), down & (cell[0] == "stairs"))
+        for cell in dict.fromkeys(
+            (kind, level) for kind in table.LANES for level in ("easy", "medium", "hard", "ood")
+        )
+    }
+
+
+def test_a_row_counts_failures_by_way_cause_and_speed():
+    row = table.cells([outcomes(7, 10, speed=0.65, cause="hit")])[0]
+    assert (row["kind"], row["level"], row["size_m"]) == ("stairs", "easy", 0.10)
+    assert (row["trials"], row["successes"], row["rate"]) == (10, 7, 0.7)
+    assert (row["up_failures"], row["down_failures"]) == (0, 3)
+    assert row["failures"] == {name: 3 * (name == "hit") for name in trials.FAILURES}
+    assert [(bin["trials"], bin["successes"]) for bin in row["by_speed"]] == [
+        (0, 0), (0, 0), (10, 7), (0, 0),
+    ]  # fmt: skip
+    assert row["paper"]["rate"] == 0.9985 and row["paper"]["significant"]
+    assert row["paper"]["difference"] == pytest.approx(0.7 - 0.9985)
+
+
+def test_several_policies_are_pooled_with_their_spread():
+    rows = table.cells([outcomes(10, 10), outcomes(4, 10), outcomes(7, 10)])
+    row = rows[-1]
+    assert (row["trials"], row["successes"]) == (30, 21)
+    assert row["by_policy"] == [1.0, 0.4, 0.7] and row["spread"] == pytest.approx(0.3)
+    assert row["up_failures"] is None
+    whole = table.overall(rows)
+    assert [whole[key] for key in ("rate", "trained", "ood")] == pytest.approx([0.7, 0.7, 0.7])
+    assert whole["paper"] == pytest.approx(0.904583, abs=1e-5)
+    assert whole["paper_trained"] == pytest.approx(0.981111, abs=1e-5)
+
+
+def test_the_width_of_the_interval_is_said():
+    # Wilson at 50 of 100: 0.4038 to 0.5962
+    assert "+-9.6 at 50 %" in table.width(100)
+
+
+def test_training_settings_do_not_change_the_compiled_program():
+    a = config.override(C, {"run": {"seed": 3}, "ppo": {"epochs": 1}, "terrain": {"name": "gap"}})
+    assert evaluation.trial_config(a) == evaluation.trial_config(C)
+    assert dataclasses.replace(evaluation.trial_config(a)).episode.length == 40.0
