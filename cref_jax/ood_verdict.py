@@ -17,7 +17,8 @@ PASSED = 0.5  # share of a scene's trials that must come to its end; assumed: th
 # scenes, and does not say what it takes
 RULE = (
     f"A scene is passed when at least {PASSED:.0%} of its trials come to its end within 40 s, "
-    "without a fall, a step off the path or a stall (less than 0.3 of the commanded distance over 10 s)."
+    "without a fall, a step off the path or a stall (less than 0.3 of the commanded distance over "
+    "10 s)."
 )
 
 
