@@ -245,6 +245,7 @@ def strip(
 ) -> None:
     """Draw depth and attention of the followed robot that came furthest, at each of MOMENTS."""
     c, seen, k = world.config, watched.seen, world.lanes.kinds.index(kind)
+    grid = gaze.grid(c)
     far = np.where(watched.alive, seen.base_x, -np.inf)[:, followed].max(axis=0)
     place = int(np.argmax(far))
     mine = np.flatnonzero(frames.robot == followed[place])
@@ -256,7 +257,7 @@ def strip(
     lane = watch.name_of_lane(world, kind)
     figure.suptitle(
         f"one robot on {lane}; x: from the lane's first edge to its pelvis\n"
-        "orange: attention, each map up to its own largest; blue: tokens with a ground edge",
+        "orange: attention, each map up to its own largest; blue dots: tokens with a ground edge",
         fontsize=9,
     )
     if not mine.size:
@@ -270,9 +271,8 @@ def strip(
         axes[0, column].set_title(f"x = {there:+.2f} m", fontsize=9)
         weights = frames.attention[at]
         for row, given in enumerate([weights.mean(axis=0), *weights], start=1):
-            edges = frames.targets["ground edge"][at].astype(np.float32)
-            given, edges = (gaze.upsampled(x, gaze.grid(c), c.camera.shape) for x in (given, edges))
-            overlay(axes[row, column], image, given, edges)
+            edges = frames.targets["ground edge"][at].reshape(grid)
+            overlay(axes[row, column], image, gaze.upsampled(given, grid, image.shape), edges)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
     names = [
@@ -288,15 +288,16 @@ def overlay(
     axis: Axes,
     image: Float[np.ndarray, "H W"],
     weights: Float[np.ndarray, "H W"],
-    edges: Float[np.ndarray, "H W"],
+    edges: Bool[np.ndarray, "rows columns"],
 ) -> None:
-    """Draw attention over the depth image, and the outline of the tokens with an edge."""
+    """Draw attention over the depth image, and a dot in the tokens with an edge."""
     axis.imshow(image, cmap="gray_r", vmin=-0.7, vmax=0.5)
     paint = np.ones((*image.shape, 4)) * matplotlib.colors.to_rgba("darkorange")
     paint[..., 3] = weights / weights.max()
     axis.imshow(paint)
-    if 0.0 < edges.max() != edges.min():
-        axis.contour(edges, levels=[0.5 * edges.max()], colors="tab:blue", linewidths=0.8)
+    row, column = np.nonzero(edges)
+    high, wide = image.shape[0] / edges.shape[0], image.shape[1] / edges.shape[1]
+    axis.plot((column + 0.5) * wide - 0.5, (row + 0.5) * high - 0.5, ".", color="b", ms=2.5)
 
 
 def maps_and_bars(
