@@ -5,15 +5,12 @@ scene's name and its own number, so that it is the same whatever else is asked f
 under every condition: what differs between two conditions is what they do.
 """
 
-import concurrent.futures
 import functools
 import math
-import multiprocessing
-import os
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cref_jax import deploy  # before numpy, whose number of threads it sets
 
@@ -26,7 +23,7 @@ from cref_jax.film import write_video  # before mujoco, whose OpenGL it chooses
 import numpy as np
 from rich.progress import track
 
-from cref_jax import evaluation, exported, ood, ood_verdict, robot, scene, stand_in
+from cref_jax import evaluation, exported, ood, ood_verdict, processes, robot, scene, stand_in
 from cref_jax.config import Config, ConfigError
 from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
@@ -89,7 +86,8 @@ def judge(
             f"{trials}, {stress_trials} and {seed}"
         )
     path, found = policy or exported.bundled(), dict(scenes or ood.scenes())
-    runner = _Runner(path, found, seed, seconds)
+    arguments = (path, found, seed, seconds)
+    _Runner(*arguments)  # refuses what is no policy before any process is started
     conditions = (GOOD, *(CONDITIONS if stress_trials else ()))
     jobs = [
         _Job(name, number, condition)
@@ -98,7 +96,8 @@ def judge(
         for number in range(trials if condition is GOOD else stress_trials)
     ]
     table = {condition: {name: [] for name in found} for condition in conditions}
-    for job, outcome in zip(jobs, _outcomes(runner, jobs, workers), strict=True):
+    outcomes = processes.run(_Runner, arguments, jobs, workers)
+    for job, outcome in zip(jobs, outcomes, strict=True):
         table[job.condition][job.scene].append(outcome)
     titles = {name: ground.title for name, ground in found.items()}
     return ood_verdict.verdict(titles, table)
@@ -153,7 +152,6 @@ class _Runner:
         if exported.is_run(path):
             raise ConfigError(f"{path} is no exported policy; make one: python -m cref_jax.export")
         self.config: Config = evaluation.evaluation_config(exported.read_config(path), seconds)
-        self.arguments = (path, scenes, seed, seconds)
         self._contents = deploy.contents(path)
         self._scenes, self._seed, self._seconds = scenes, seed, seconds
         self._body = functools.cache(self._compiled)
@@ -162,7 +160,7 @@ class _Runner:
         """Return the policy, reset."""
         return deploy.Policy(*self._contents)
 
-    def outcome(self, job: _Job) -> Outcome:
+    def __call__(self, job: _Job) -> Outcome:
         """Return what a trial is counted by."""
         t = self.trial(job)
         return Outcome(t.ending, t.seconds, t.progress, t.speed, t.status)
@@ -179,41 +177,6 @@ class _Runner:
         return StandIn(self.config, self._scenes[name], self.policy().joints.names, friction)
 
 
-def _outcomes(runner: _Runner, jobs: Sequence[_Job], workers: int | None) -> list[Outcome]:
-    """Run the trials.
-
-    In processes: numpy's share of a control step is many small calls, which threads of one
-    interpreter take turns at. A fresh interpreter each, since JAX does not survive a fork.
-    """
-    shown = functools.partial(track, description="walking", total=len(jobs), transient=True)
-    workers = workers or os.cpu_count() or 1
-    if workers == 1:
-        return [runner.outcome(job) for job in shown(jobs)]
-    pool = concurrent.futures.ProcessPoolExecutor(
-        min(workers, len(jobs)),
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_begin,
-        initargs=runner.arguments,
-    )
-    try:
-        return list(shown(pool.map(_one, jobs)))
-    finally:  # Ctrl-C does not wait for those that have not begun
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
 def _rng(name: str, seed: int, number: int, what: int = 0) -> np.random.Generator:
     """Return the generator of a trial; `what` is 0 for its start, 1 for its disturbance."""
     return np.random.default_rng([seed, zlib.crc32(name.encode()), number, what])
-
-
-_worker: _Runner | None = None  # of a worker's process: policy and models are made once in each
-
-
-def _begin(*arguments: Any) -> None:
-    global _worker
-    _worker = _Runner(*arguments)
-
-
-def _one(job: _Job) -> Outcome:
-    assert _worker is not None
-    return _worker.outcome(job)

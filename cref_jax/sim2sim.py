@@ -1,8 +1,6 @@
 """An exported policy on the robot's stand-in: `python -m cref_jax.sim2sim --policy policy/`."""
 
-import concurrent.futures
 import json
-import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +17,8 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-from cref_jax import cli, evaluation, exported, runs, scene, stand_in
-from cref_jax.config import ConfigError
+from cref_jax import cli, evaluation, exported, processes, runs, scene, stand_in
+from cref_jax.config import Config, ConfigError
 from cref_jax.disturbance import Disturbance
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
@@ -94,24 +92,26 @@ def main(arguments: list[str] | None = None) -> None:
 
 def walked(world: World, path: Path, options: Options) -> list[Trial]:
     """Return the trials of the policy there, on all cores."""
-    c, contents = world.config, deploy.contents(path)
-    joints = deploy.Policy(*contents).joints.names
-    bodies = [StandIn(c, lane_of(world, level), joints) for level in range(world.lanes.levels)]
-    late = Disturbance(latency=max(0, round(options.latency / c.physics.control_period)))
-
-    def one(start: Start, level: int) -> Trial:
-        policy = deploy.Policy(*contents)
-        return stand_in.run(bodies[level], policy, start, TRIAL_SECONDS, late)
-
-    begun = starts(world, options.seed, options.trials)
+    lanes = [lane_of(world, level) for level in range(world.lanes.levels)]
     _, levels = evaluation.crossing_lanes(options.trials)
-    pool = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
-    try:
-        return list(
-            track(pool.map(one, begun, levels), "walking", total=len(begun), transient=True)
-        )
-    finally:  # Ctrl-C does not wait for those that have not begun
-        pool.shutdown(wait=False, cancel_futures=True)
+    jobs = list(zip(starts(world, options.seed, options.trials), levels.tolist(), strict=True))
+    return processes.run(_Walker, (world.config, path, lanes, options.latency), jobs)
+
+
+class _Walker:
+    """Runs trials of one policy; policy and models are made once."""
+
+    def __init__(self, c: Config, path: Path, lanes: list[Lane], latency: float) -> None:
+        self._contents = deploy.contents(path)
+        joints = deploy.Policy(*self._contents).joints.names
+        self._bodies = [StandIn(c, lane, joints) for lane in lanes]
+        late = max(0, round(latency / c.physics.control_period))
+        self._disturbance = Disturbance(latency=late)
+
+    def __call__(self, job: tuple[Start, int]) -> Trial:
+        start, level = job
+        policy = deploy.Policy(*self._contents)
+        return stand_in.run(self._bodies[level], policy, start, TRIAL_SECONDS, self._disturbance)
 
 
 def lane_of(world: World, level: int = 0) -> Lane:

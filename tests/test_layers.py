@@ -13,7 +13,7 @@ NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
     {"config", "geometry", "deploy", "leaves", "layers"},
-    {"paper", "proportion", "stall", "disturbance"},
+    {"paper", "proportion", "stall", "disturbance", "processes"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
     {"physics", "depth", "foothold", "evaluation_page"},

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cref_jax import deploy, exported, ood, ood_suite, ood_verdict, scene
+from cref_jax import deploy, exported, ood, ood_suite, ood_verdict, processes, scene
 from cref_jax.config import ConfigError
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Disturbance
@@ -21,8 +21,16 @@ def outcome(ending, seconds=9.0, status=Status.OK):
     return Outcome(ending, seconds, 5.0, 0.5, status)
 
 
-def runner(seed=0, seconds=0.4):
-    return ood_suite._Runner(exported.bundled(), FEW, seed, seconds)
+def arguments(seed=0):
+    return exported.bundled(), FEW, seed, 0.4
+
+
+def runner():
+    return ood_suite._Runner(*arguments())
+
+
+def outcomes(jobs, seed=0, workers=1):
+    return processes.run(ood_suite._Runner, arguments(seed), jobs, workers)
 
 
 def jobs(count, condition=GOOD):
@@ -30,23 +38,21 @@ def jobs(count, condition=GOOD):
 
 
 def test_a_trial_is_the_same_however_many_are_asked_for():
-    few, many = (
-        dict(zip(jobs(n), ood_suite._outcomes(runner(), jobs(n), 1), strict=True)) for n in (2, 4)
-    )
+    few, many = (dict(zip(jobs(n), outcomes(jobs(n)), strict=True)) for n in (2, 4))
     assert all(many[job] == found for job, found in few.items())
     assert len({found.progress for found in many.values()}) == len(many)
 
 
 def test_the_same_seed_gives_the_same_trials_and_another_one_others():
     bad = Condition("bad", Disturbance(dropped=0.3, invalid=0.2))
-    first, again, other = (ood_suite._outcomes(runner(seed), jobs(1, bad), 1) for seed in (0, 0, 1))
+    first, again, other = (outcomes(jobs(1, bad), seed) for seed in (0, 0, 1))
     assert first == again
     assert all(a != b for a, b in zip(first, other, strict=True))
 
 
 @pytest.mark.slow
 def test_the_trials_do_not_depend_on_the_number_of_processes():
-    one, two = (ood_suite._outcomes(runner(), jobs(2), workers) for workers in (1, 2))
+    one, two = (outcomes(jobs(2), workers=workers) for workers in (1, 2))
     assert one == two
 
 

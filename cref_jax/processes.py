@@ -1,0 +1,56 @@
+"""The same work many times over, in a process a core.
+
+For work that is half numpy's many small calls, which threads of one interpreter take turns at. Each
+process is a fresh interpreter, since JAX does not survive a fork, and makes its worker once.
+"""
+
+import concurrent.futures
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+from rich.progress import track
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+
+def run(
+    make: Callable[..., Callable[[J], R]],
+    arguments: tuple[Any, ...],
+    jobs: Sequence[J],
+    count: int | None = None,
+) -> list[R]:
+    """Return what a worker, `make(*arguments)`, says to each job, with a progress bar.
+
+    Args:
+        make: a class or function of a module, so that another process finds it.
+        arguments: can be pickled, as jobs and results can.
+        jobs: in the order of the results.
+        count: of processes; one a core when left out; with 1 all is done in this one.
+    """
+    count = min(count or os.cpu_count() or 1, len(jobs))
+    shown = lambda results: list(track(results, "walking", len(jobs), transient=True))
+    if count == 1:
+        return shown(map(make(*arguments), jobs))
+    pool = concurrent.futures.ProcessPoolExecutor(
+        count, multiprocessing.get_context("spawn"), _begin, (make, arguments)
+    )
+    try:
+        return shown(pool.map(_work, jobs))
+    finally:  # Ctrl-C does not wait for those that have not begun
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+_worker: Callable[[Any], Any] | None = None  # of this process
+
+
+def _begin(make: Callable[..., Callable[[Any], Any]], arguments: tuple[Any, ...]) -> None:
+    global _worker
+    _worker = make(*arguments)
+
+
+def _work(job: Any) -> Any:
+    assert _worker is not None
+    return _worker(job)
