@@ -90,7 +90,7 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
-    lived = episode.commanded(world, lived, key_command)
+    lived = episode.commanded(world, episode.marked(world, lived), key_command)
     last = observe(world, lived, key_see)
 
     done = ending.terminated | ending.truncated

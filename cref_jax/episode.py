@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import config, foothold, geometry
+from cref_jax import config, foothold, geometry, stall
 from cref_jax.foothold import Candidates
 from cref_jax.host_physics import Dynamics
 from cref_jax.kinematics import Links
@@ -37,6 +37,7 @@ class EnvState:
     command_left: Int[Array, ""]  # control steps until the next draw
     push_left: Int[Array, ""]  # control steps until the next push
     commanded: Float[Array, ""]  # m, distance asked for so far
+    mark: Float[Array, "2"]  # m, x and the distance asked for at the last look for a stall
     action: Float[Array, " J"]  # a_{t-1}
     action_before: Float[Array, " J"]  # a_{t-2}
     foot_velocity: Float[Array, "F 3"]  # m/s, world
@@ -50,20 +51,22 @@ class EnvState:
 
 
 class Ending(NamedTuple):
-    """Why an episode is over; the first five are failures."""
+    """Why an episode is over; the first six are failures."""
 
     tilted: Bool[Array, ""]
     low: Bool[Array, ""]  # the pelvis is too near to the support
     hit: Bool[Array, ""]  # torso, head, pelvis or thigh is in the terrain
     dropped: Bool[Array, ""]  # a foot is far below the last support
     unstable: Bool[Array, ""]  # the physics has blown up
+    stalled: Bool[Array, ""]  # it hardly moves, though it is told to walk
     finished: Bool[Array, ""]  # at the lane's end
     timeout: Bool[Array, ""]
 
     @property
     def terminated(self) -> Bool[ArrayLike, "..."]:
         """The robot has failed: no value follows."""
-        return self.tilted | self.low | self.hit | self.dropped | self.unstable
+        fell = self.tilted | self.low | self.hit | self.dropped | self.unstable
+        return fell | self.stalled
 
     @property
     def truncated(self) -> Bool[ArrayLike, "..."]:
@@ -93,6 +96,7 @@ def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Arra
         command_left=_drawn_steps(c, keys[4], c.command.period),
         push_left=_drawn_steps(c, keys[5], c.randomisation.push_period),
         commanded=jnp.zeros(()),
+        mark=jnp.stack([body.qpos[0], 0.0]),
         action=jnp.zeros(joints),
         action_before=jnp.zeros(joints),
         foot_velocity=jnp.zeros((2, 3)),
@@ -157,9 +161,16 @@ def ending(world: World, state: EnvState, links: Links, unstable: Bool[Array, ""
         hit=world.physics.is_hit(world.lanes.tile(state.level, state.kind), links),
         dropped=foot_z.min() < state.support_z - c.episode.below_edge,
         unstable=unstable,
+        stalled=has_end & _looks(world, state) & _stands(state),
         finished=has_end & (state.body.qpos[0] > world.lanes.end - c.episode.lane_end),
         timeout=state.step >= round(c.episode.length / c.physics.control_period),
     )
+
+
+def marked(world: World, state: EnvState) -> EnvState:
+    """Note where the robot is when it is looked at for a stall."""
+    here = jnp.stack([state.body.qpos[0], state.commanded])
+    return state.replace(mark=jnp.where(_looks(world, state), here, state.mark))
 
 
 def promoted(
@@ -183,6 +194,20 @@ def promoted(
     key_review, key_level = jax.random.split(key)
     review = (earned > top) | (jax.random.uniform(key_review) < c.review)
     return rank, jnp.where(review, jax.random.randint(key_level, (), 0, rank + 1), rank)
+
+
+def _looks(world: World, state: EnvState) -> Bool[Array, ""]:
+    """Return whether this is a step at which a robot is looked at for a stall."""
+    c = world.config
+    if c.episode.stall_time == 0.0:
+        return jnp.zeros((), bool)
+    return state.step % round(c.episode.stall_time / c.physics.control_period) == 0
+
+
+def _stands(state: EnvState) -> Bool[Array, ""]:
+    """Return whether the robot has hardly come forward since the last look."""
+    came, asked = state.body.qpos[0] - state.mark[0], state.commanded - state.mark[1]
+    return came < stall.STALL_SHARE * asked
 
 
 def _asked(world: World, state: EnvState) -> Float[Array, ""]:

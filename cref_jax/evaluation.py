@@ -83,7 +83,7 @@ def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
         command=dataclasses.replace(
             c.command, lane_vx=COMMANDS, open_kinds=(), period=(2 * seconds, 2 * seconds)
         ),
-        episode=dataclasses.replace(c.episode, length=seconds),
+        episode=dataclasses.replace(c.episode, length=seconds, stall_time=0.0),
     )
 
 

@@ -57,6 +57,7 @@ ENDINGS = {  # of an episode, by its name in episode.Ending
     "hit": "fell, its upper body on the ground",
     "dropped": "stepped into the depth",
     "unstable": "blew up in the simulation",
+    "stalled": "stood still for too long",
     "finished": "came to the end of the lane",
     "timeout": "ran out of time",
 }

@@ -235,6 +235,30 @@ def test_the_end_of_a_lane_is_a_success_and_open_ground_has_none(world, causes, 
     assert causes(on("gap", put(state, x=LENGTH - 1.01))) == set()
 
 
+@pytest.mark.parametrize(
+    ("kind", "step", "came", "expected"),
+    [
+        ("gap", 500, 0.89, {"stalled"}),  # less than 0.3 of the 3 m since the last look
+        ("gap", 500, 0.91, set()),
+        ("gap", 499, 0.0, set()),  # looked at each 5 s only
+        ("flat", 500, 0.0, set()),  # in the open it may be told to stand
+    ],
+)
+def test_a_robot_that_stands_in_its_lane_has_stalled(causes, robots, kind, step, came, expected):
+    state = put(one(robots), x=2.0 + came)
+    state = state.replace(
+        step=jnp.int32(step), mark=jnp.array([2.0, 4.0]), commanded=jnp.float32(7.0)
+    )
+    assert causes(on(kind, state)) == expected
+
+
+def test_a_look_is_noted(world, robots):
+    state = put(one(robots), x=3.0).replace(commanded=jnp.float32(2.5))
+    for step, expected in ((250, [3.0, 2.5]), (251, np.asarray(state.mark))):
+        found = episode.marked(world, state.replace(step=jnp.int32(step))).mark
+        np.testing.assert_allclose(found, expected)
+
+
 def test_time_runs_out_after_20_s(causes, robots):
     assert causes(one(robots).replace(step=jnp.int32(1000))) == {"timeout"}
     assert causes(one(robots).replace(step=jnp.int32(999))) == set()

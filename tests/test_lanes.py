@@ -14,14 +14,14 @@ from cref_jax.config import ConfigError
 CELL = 0.02  # m
 TRAIN = {  # m, Table II where it has the kind
     "flat": (0.0, 0.0),
-    "rough": (0.02, 0.06),
-    "slope": (0.05, 0.35),
-    "stairs_up": (0.05, 0.20),
-    "stairs_down": (0.05, 0.20),
-    "gap": (0.10, 0.75),
-    "platform": (0.05, 0.40),
+    "rough": (0.0, 0.06),
+    "slope": (0.0, 0.35),
+    "stairs_up": (0.0, 0.20),
+    "stairs_down": (0.0, 0.20),
+    "gap": (0.0, 0.75),
+    "platform": (0.0, 0.40),
 }
-FLIGHTS = {"ascent": (0.05, 0.20), "descent": (0.05, 0.20)}
+FLIGHTS = {"ascent": (0.0, 0.20), "descent": (0.0, 0.20)}
 
 
 @pytest.fixture(scope="module")

@@ -69,13 +69,13 @@ def test_debug_shows_where_a_mistake_was_noticed():
 
 
 def test_a_level_is_a_size_of_the_terrain():
-    # stairs rise from 0.05 to 0.20 m over 10 levels: level 3 is 0.05 + 3 * 0.15 / 9 = 0.10
+    # stairs rise from 0 to 0.20 m over 10 levels: level 3 is 3 * 0.20 / 9
     c = Config().terrain
     c = type(c)(name="stairs")
     size = lambda **asked: float(play._lane(c, Options(**asked)).sizes[0, 0])
-    assert size(level=3) == pytest.approx(0.10)
+    assert size(level=3) == pytest.approx(0.20 / 3)
     assert size(level="ood", kind="stairs_down") == pytest.approx(0.23)
-    assert size() == pytest.approx(0.05 + 5 * 0.15 / 9)
+    assert size() == pytest.approx(5 * 0.20 / 9)
 
 
 def test_the_summary_worked_by_hand():
