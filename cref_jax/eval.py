@@ -1,10 +1,10 @@
 """Judge a policy: `python -m cref_jax.eval --suite table`."""
 
+import contextlib
 import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -148,7 +148,7 @@ def _film(subject: Subject, options: Options, out: Path) -> None:
     print(f"wrote {out}: {trial.ending} after {trial.seconds:.1f} s and {trial.progress:.1f} m")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _exported(subject: Subject) -> Iterator[Path]:
     """Yield the policy as an exported one; a run's is written for the time being."""
     if not exported.is_run(subject.source):
@@ -200,7 +200,7 @@ def _origin(subjects: list[Subject]) -> dict[str, Any]:
     }
 
 
-@contextmanager
+@contextlib.contextmanager
 def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
     """Yield what is told of the trials that have come to an end, and shows how many are left."""
     bar = Progress(
@@ -226,15 +226,29 @@ def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _write(out: Path, record: dict[str, Any]) -> None:
-    """Write eval.json, and the same as a page for people."""
+    """Write eval.json, and the same as a page for people.
+
+    What is there of another suite stays, under that suite's name.
+    """
     path = out / "eval.json"
     try:
         out.mkdir(parents=True, exist_ok=True)
+        before = _suite(path)
+        if before not in (None, record["suite"]):
+            for old in out.glob("eval.*"):
+                old.replace(old.with_stem(f"eval_{before}"))
         path.write_text(json.dumps(record, indent=2) + "\n")
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from None
     evaluation_page.write(record, out / "eval.html")
     print(f"wrote {path} and eval.html")
+
+
+def _suite(path: Path) -> str | None:
+    """Return the suite of an evaluation that has been written, None if there is none."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        return json.loads(path.read_text())["suite"]
+    return None
 
 
 if __name__ == "__main__":
