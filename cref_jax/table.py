@@ -109,7 +109,9 @@ def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
     """Return the table for the terminal, in percent."""
     table = Table(box=None, padding=(0, 1))
     table.add_column("success, %", no_wrap=True)
-    for title in ("trials", "ours", "95 %", "paper", "difference", "up", "down"):
+    several = len(rows[0]["by_policy"]) > 1
+    titles = ("trials", "ours", "95 %", "paper", "difference", "up", "down")
+    for title in (*titles, *(["each policy"] if several else [])):
         table.add_column(title, justify="right", no_wrap=True)
     for row in rows:
         both_ways = row["up_failures"], row["down_failures"]
@@ -120,6 +122,7 @@ def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
                 row["rate"], row["paper"]["rate"], _rate(row), row["paper"]["significant"]
             ),
             *("" if failures is None else str(failures) for failures in both_ways),
+            *([", ".join(f"{100 * rate:.0f}" for rate in row["by_policy"])] if several else []),
             end_section=row["level"] == "ood",
         )
     ours = Rate(whole["rate"], whole["wilson_low"], whole["wilson_high"])
