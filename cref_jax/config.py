@@ -149,7 +149,7 @@ class Episode:
     below_edge: float = 0.5  # m, a foot below the last support: into a gap; assumed: two 23 cm
     # treads at once are still a step, and gap floors lie 1 m down
     stall_time: float = 5.0  # s between two looks whether a robot stands in its lane, 0: none;
-    # assumed: half of what a trial gives it. Without them standing before an obstacle pays
+    # assumed: half of what a trial gives it. Nothing is learned from standing before an obstacle
     start_x: tuple[float, float] = (0.5, 1.0)  # m along the lane; assumed
     start_y: tuple[float, float] = (-0.3, 0.3)  # m across the lane; assumed
     lane_end: float = 1.0  # m before the lane's end where an episode is won; assumed

@@ -51,7 +51,7 @@ class EnvState:
 
 
 class Ending(NamedTuple):
-    """Why an episode is over; the first six are failures."""
+    """Why an episode is over; the first five are failures."""
 
     tilted: Bool[Array, ""]
     low: Bool[Array, ""]  # the pelvis is too near to the support
@@ -65,13 +65,12 @@ class Ending(NamedTuple):
     @property
     def terminated(self) -> Bool[ArrayLike, "..."]:
         """The robot has failed: no value follows."""
-        fell = self.tilted | self.low | self.hit | self.dropped | self.unstable
-        return fell | self.stalled
+        return self.tilted | self.low | self.hit | self.dropped | self.unstable
 
     @property
     def truncated(self) -> Bool[ArrayLike, "..."]:
         """The episode was cut although the robot could have gone on."""
-        return (self.finished | self.timeout) & ~self.terminated
+        return (self.finished | self.timeout | self.stalled) & ~self.terminated
 
 
 def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Array, ""]) -> EnvState:
@@ -187,7 +186,7 @@ def promoted(
     if not c.enabled:
         return state.rank, state.level
     walked = state.body.qpos[0] - state.start[0]
-    up = ~over.terminated & (over.finished | (walked > c.up * world.lanes.length))
+    up = ~over.terminated & ~over.stalled & (over.finished | (walked > c.up * world.lanes.length))
     down = ~up & (walked < c.down * _asked(world, state))
     earned = state.rank + (up.astype(jnp.int32) - down) * (state.level == state.rank)
     rank = jnp.clip(earned, 0, top)

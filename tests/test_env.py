@@ -28,7 +28,6 @@ def still(robots):
 
 
 def test_a_timeout_gives_a_fresh_robot_and_the_last_state_of_the_old_one(world, step, robots):
-    robots = robots.replace(mark=jnp.tile(jnp.array([-9.0, 0.0]), (ROBOTS, 1)))  # it has moved
     early, late = (
         robots.replace(step=jnp.full(ROBOTS, 500, jnp.int32)),
         robots.replace(step=jnp.full(ROBOTS, 999, jnp.int32)),

@@ -266,7 +266,7 @@ def test_time_runs_out_after_20_s(causes, robots):
 
 @pytest.mark.parametrize("cause", Ending._fields)
 def test_only_an_end_without_a_failure_truncates(cause):
-    fails = cause not in ("finished", "timeout")
+    fails = cause not in ("finished", "timeout", "stalled")
     over = Ending(*(jnp.array(name == cause) for name in Ending._fields))
     assert bool(over.terminated) == fails and bool(over.truncated) != fails
     both = over._replace(timeout=jnp.array(True))
@@ -285,6 +285,7 @@ def test_only_an_end_without_a_failure_truncates(cause):
         (4.4, 9.0, 1, "timeout", 0),  # less than half of it
         (0.1, 9.0, 0, "tilted", 0),  # never below the easiest
         (11.0, 9.0, 1, "tilted", 1),  # far, but fell
+        (6.1, 9.0, 1, "stalled", 1),  # far, but stands now
         (1.0, 1.0, 1, "tilted", 0),  # fell early, in the first metre of the 9 to come
         (3.0, 9.0, 1, "finished", 2),  # reached the end, however long the lane was
     ],
