@@ -37,6 +37,23 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         os._exit(130)  # at once: a running program may call into this interpreter until its end
 
 
+def writable(out: Path, suffix: str) -> Path:
+    """Return the file to write, its folder made.
+
+    Raises:
+        ConfigError: its name does not end in `suffix`, or it cannot be written.
+    """
+    if out.suffix != suffix:
+        raise ConfigError(f"--out must end in {suffix}: {out}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
+    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
+        raise ConfigError(f"cannot write {out}")
+    return out
+
+
 def prepare() -> None:
     """Set JAX up, before it is used for the first time."""
     _use_wide_registers()

@@ -6,7 +6,6 @@ Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
 import dataclasses
 import functools
 import math
-import os
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -140,7 +139,9 @@ def play(options: Options) -> None:
     is_trained = options.agent == "trained"
     source = exported.chosen(options.run, options.policy) if is_trained else options.run
     c = exported.read_config(source) if source else Config()
-    out = _writable(options, source if source and exported.is_run(source) else None)
+    suffix = ".png" if options.stills else ".mp4"
+    folder = source if source and exported.is_run(source) else Path()
+    out = cli.writable(options.out or folder / f"play{suffix}", suffix)
     world = _world(options, c)
     train = exported.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
@@ -241,21 +242,6 @@ def _check(options: Options) -> None:
         raise ConfigError(f"--command must be a number, m/s: {options.command}")
     if options.stills < 0:
         raise ConfigError(f"--stills must not be below 0: {options.stills}")
-
-
-def _writable(options: Options, run: Path | None) -> Path:
-    """Return the file to write, its folder made."""
-    suffix = ".png" if options.stills else ".mp4"
-    out = options.out or (run or Path()) / f"play{suffix}"
-    if out.suffix != suffix:
-        raise ConfigError(f"--out must end in {suffix}: {out}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
-    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
-        raise ConfigError(f"cannot write {out}")
-    return out
 
 
 def _world(options: Options, c: Config) -> World:

@@ -8,9 +8,9 @@ import csv
 import dataclasses
 import functools
 import math
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,6 +45,22 @@ CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
 STAIRS = ("stairs_up", "stairs_down", "ascent", "descent")
 BEFORE = 0.5  # m before an obstacle from where a robot is on its way over it; assumed: a stride
 ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked of every laboratory."""
+
+    command: float = 0.6
+    """m/s forward"""
+    num_envs: int | None = None
+    """robots; when left out 64 on a CPU, and hundreds or thousands on an accelerator"""
+    seed: int = 0
+    """of the first states"""
+    engine: EngineName = "auto"
+    """mujoco steps on the CPU, mjx on the device"""
+    debug: bool = False
+    """show the traceback of an error"""
 
 
 class Moment(NamedTuple):
@@ -239,23 +255,6 @@ def onsets(flag: Bool[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
     """Return where a flag goes up along the first axis, time; one that is up at first does."""
     before = np.concatenate([np.zeros_like(flag[:1]), flag[:-1]])
     return flag & ~before
-
-
-def picture(out: Path) -> Path:
-    """Return the picture to write, its folder made; the table stands beside it, as .csv.
-
-    Raises:
-        ConfigError: it is no .png, or cannot be written.
-    """
-    if out.suffix != ".png":
-        raise ConfigError(f"--out must end in .png: {out}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
-    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
-        raise ConfigError(f"cannot write {out}")
-    return out
 
 
 def write_table(out: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

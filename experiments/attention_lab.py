@@ -39,7 +39,6 @@ from matplotlib.figure import Figure, SubFigure
 
 from cref_jax import cli, gaze, profile, watch
 from cref_jax.config import Config, ConfigError
-from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -58,7 +57,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(watch.Options):
     """Draw what the attention of a policy looks at, and count it."""
 
     run: Path | None = None
@@ -67,20 +66,10 @@ class Options:
     """an exported policy (a directory or .zip) instead of a run"""
     kind: str | None = None
     """of the lane that one robot is followed on; when left out, of the policy's own terrain"""
-    command: float = 0.6
-    """m/s forward"""
     seconds: float = 20.0
     """length of a trial"""
-    num_envs: int | None = None
-    """robots; 64 on a CPU, 512 on an accelerator when left out"""
-    seed: int = 0
-    """of the first states"""
-    engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
     out: Path = Path("attention.png")
     """the picture to write; the table stands beside it"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Step(NamedTuple):
@@ -123,7 +112,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
         cli.prepare()
-        out = watch.picture(options.out)
+        out = cli.writable(options.out, ".png")
         policy, world = watch.opened(options.run, options.policy, options.engine)
         c = policy.config
         check(c)

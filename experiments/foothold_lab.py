@@ -41,7 +41,6 @@ from matplotlib.axes import Axes
 
 from cref_jax import cli, evaluation, exported, foothold, kinematics, lanes, profile, terrain, watch
 from cref_jax.config import ConfigError
-from cref_jax.physics import EngineName
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -59,7 +58,7 @@ COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(watch.Options):
     """Compare where policies put their feet on stairs."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.arg(metavar="LABEL=PATH ...")] = ()
@@ -70,20 +69,10 @@ class Options:
     """one run; the newest when nothing is named, or the bundled policy where there is none"""
     rise: float = 0.20
     """m, of a step"""
-    command: float = 0.6
-    """m/s forward"""
     seconds: float = 40.0
     """length of a trial"""
-    num_envs: int | None = None
-    """robots; 64 on a CPU, 2048 on an accelerator when left out"""
-    seed: int = 0
-    """of the first states"""
-    engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
     out: Path = Path("footholds_on_stairs.png")
     """the picture to write; the table stands beside it"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Step(NamedTuple):
@@ -135,7 +124,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
         cli.prepare()
-        out = watch.picture(options.out)
+        out = cli.writable(options.out, ".png")
         found = {label: measured(path, options) for label, path in named(options).items()}
         for label, ways in found.items():
             for way, name in WAYS.items():

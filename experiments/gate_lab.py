@@ -32,7 +32,6 @@ from matplotlib.axes import Axes
 
 from cref_jax import cli, profile, watch
 from cref_jax.config import Config, ConfigError
-from cref_jax.physics import EngineName
 from cref_jax.terrain import Terrain
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
@@ -49,7 +48,7 @@ COLUMNS = ("group", "state", "n", "robots", "mean", "q25", "median", "q75", "not
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(watch.Options):
     """Group the highway gate of a policy by terrain, contact phase and posture."""
 
     run: Path | None = None
@@ -58,20 +57,10 @@ class Options:
     """an exported policy (a directory or .zip) instead of a run"""
     kind: str | None = None
     """of the lane that one robot is traced on; when left out, of the policy's own terrain"""
-    command: float = 0.6
-    """m/s forward"""
     seconds: float = 20.0
     """length of a trial"""
-    num_envs: int | None = None
-    """robots; 64 on a CPU, 4096 on an accelerator when left out"""
-    seed: int = 0
-    """of the first states"""
-    engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
     out: Path = Path("gate.png")
     """the picture to write; the table stands beside it"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Step(NamedTuple):
@@ -105,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
         cli.prepare()
-        out = watch.picture(options.out)
+        out = cli.writable(options.out, ".png")
         policy, world = watch.opened(options.run, options.policy, options.engine)
         c = policy.config
         check(c)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int
 from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
-from cref_jax import config, exported, gaze, lanes, profile, runs, watch
+from cref_jax import cli, config, exported, gaze, lanes, profile, runs, watch
 from cref_jax.config import Config, ConfigError
 from cref_jax.profile import DOWN, UP
 from cref_jax.watch import Moment, Watched
@@ -306,7 +306,7 @@ def test_onsets():
         (lambda: watch.steps_of(0.0, Config()), "--seconds must be above 0, up to 40"),
         (lambda: watch.steps_of(float("nan"), Config()), "--seconds must be above 0"),
         (lambda: watch.kind_of_lane(Config(), "gpa"), "did you mean 'gap'"),
-        (lambda: watch.picture(Path("gate.jpg")), "--out must end in .png"),
+        (lambda: cli.writable(Path("gate.jpg"), ".png"), "--out must end in .png"),
     ],
 )
 def test_a_mistake_is_one_line(call, said):
