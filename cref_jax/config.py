@@ -257,6 +257,7 @@ class PPO:
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
     target_kl: float = 0.01
     max_gradient_norm: float = 1.0
+    critic_first: int = 0  # iterations in which the critic alone learns; for a run with --init
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,21 @@ def digest(policy: Policy) -> str:
     return found.hexdigest()
 
 
+def begun(fresh: ppo.TrainState, policy: Policy) -> ppo.TrainState:
+    """Return the state of a new training whose actor begins as this policy's."""
+    seen = policy.train.statistics.obs
+    statistics = fresh.statistics.obs.replace(
+        mean=seen.mean,
+        std=seen.std,
+        summed_variance=policy.samples * jnp.square(seen.std),
+        count=fresh.statistics.obs.count + policy.samples,
+    )
+    return fresh.replace(
+        params=fresh.params._replace(actor=policy.train.params.actor),
+        statistics=fresh.statistics._replace(obs=statistics),
+    )
+
+
 def manifest(policy: Policy, driven: robot.Robot) -> dict[str, Any]:
     """Return everything but the weights, without digests."""
     c = policy.config

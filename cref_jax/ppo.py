@@ -352,8 +352,16 @@ def observe(
 def _descend(
     state: TrainState, grads: Params, losses: Losses, c: config.PPO
 ) -> tuple[TrainState, Losses]:
-    """Take one step of the optimiser at the rate that the KL asks for."""
-    rate = adapt(optax.tree.get(state.opt_state, "learning_rate"), losses.kl, c)
+    """Take one step of the optimiser at the rate that the KL asks for.
+
+    In the first `critic_first` iterations the actor stays as it is, and so does the rate.
+    """
+    before = optax.tree.get(state.opt_state, "learning_rate")
+    rate = adapt(before, losses.kl, c)
+    if c.critic_first:
+        acts = state.iteration >= c.critic_first
+        still = jax.tree.map(lambda g: jnp.where(acts, g, 0.0), grads.actor)
+        grads, rate = grads._replace(actor=still), jnp.where(acts, rate, before)
     opt_state = optax.tree.set(state.opt_state, learning_rate=rate)
     changes, opt_state = optimiser(c).update(grads, opt_state, state.params)
     state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)

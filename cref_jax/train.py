@@ -14,13 +14,14 @@ import jax
 import numpy as np
 import tyro
 
-from cref_jax import cli, config, evaluation, learn, runs
+from cref_jax import cli, config, evaluation, exported, learn, runs
 from cref_jax.checkpoint import Checkpoints, lock
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.progress import Reporter
 from cref_jax.world import World
 
+CRITIC_FIRST = 20  # iterations after --init; assumed: the values fit before the actor moves
 MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
 
 Device = Literal["auto", "cpu", "gpu"]
@@ -46,6 +47,8 @@ class Options:
     """where the program runs; gpu is an error without one"""
     run_dir: Path | None = None
     """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
+    init: Path | None = None
+    """an exported policy or a run, as which this run's actor begins; first the critic learns alone"""
     resume: bool = False
     """go on with the run in --run-dir, or with the newest one"""
     print_config: bool = False
@@ -99,6 +102,8 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     default = Command(options, base)
     command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
     c = _with_short_options(command.settings, command.options)
+    if command.options.init:
+        c = _with_init(c, command.options)
     config.check(c)
     return dataclasses.replace(command.options, device=options.device), c
 
@@ -135,7 +140,7 @@ def train(options: Options, c: Config) -> None:
                 programs = _Programs(world, report)
                 if first < c.run.iterations:
                     programs.of(min(c.run.chunk, c.run.iterations - first))
-                state = _first_state(world, steps, options.resume)
+                state = _first_state(world, steps, options)
                 state = _loop(world, state, steps, report, programs)
         _summary(run, world, state, options.evaluate)
 
@@ -218,10 +223,12 @@ def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
     return latest or 0
 
 
-def _first_state(world: World, steps: Checkpoints, resume: bool) -> learn.RunState:
-    """Return the state to begin with: fresh, or that of the newest checkpoint."""
+def _first_state(world: World, steps: Checkpoints, options: Options) -> learn.RunState:
+    """Return the state to begin with: fresh, with a policy's actor, or of the newest checkpoint."""
     state = jax.jit(learn.initial_state)(world)
-    if not resume:
+    if options.init:
+        return state.replace(train=exported.begun(state.train, exported.load(options.init, world)))
+    if not options.resume:
         return state
     stored = steps.meta()["num_envs"]
     if stored == world.config.run.num_envs:
@@ -274,6 +281,25 @@ def _with_short_options(c: Config, options: Options) -> Config:
     short = {name: getattr(options, name) for name in ("num_envs", "iterations", "seed")}
     given = {name: value for name, value in short.items() if value is not None}
     return dataclasses.replace(c, run=dataclasses.replace(c.run, **given))
+
+
+def _with_init(c: Config, options: Options) -> Config:
+    """Return the settings of a run whose actor begins as that of `--init`.
+
+    Raises:
+        ConfigError: it has another network, or there is something to resume as well.
+    """
+    if options.resume:
+        raise ConfigError("give --init or --resume, not both")
+    theirs, ours = exported.read_config(options.init or Path()).network, c.network
+    for name, value in dataclasses.asdict(theirs).items():
+        if name not in ("critic", "initial_std") and value != getattr(ours, name):
+            raise ConfigError(
+                f"--init {options.init} has another network: {name} is {value}, and here "
+                f"{getattr(ours, name)}; set --network.{name.replace('_', '-')}"
+            )
+    first = c.ppo.critic_first or CRITIC_FIRST
+    return dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, critic_first=first))
 
 
 def _name(options: Options) -> str:

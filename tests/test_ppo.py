@@ -1,3 +1,4 @@
+import dataclasses
 import math
 from functools import partial
 from typing import NamedTuple
@@ -384,6 +385,24 @@ def test_the_learning_rate_scales_the_step():
     moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), after.params, state.params)
     largest = max(float(m) for m in jax.tree.leaves(moved))
     np.testing.assert_allclose(largest, losses.learning_rate[0, 0], rtol=1e-2)
+
+
+def test_the_critic_alone_learns_first():
+    c = dataclasses.replace(C, critic_first=2)
+    state = ppo.initial_state(initial_params(), OBS, CRITIC_OBS, c)
+    after = [state]
+    for _ in range(3):
+        state, losses = ppo.update(state, some_rollout(), KEY, c, NETWORKS)
+        after.append(state)
+        if len(after) < 4:
+            np.testing.assert_allclose(losses.learning_rate, c.learning_rate)
+    same = lambda a, b: all(
+        np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
+    actors, critics = [s.params.actor for s in after], [s.params.critic for s in after]
+    assert same(actors[0], actors[1]) and same(actors[1], actors[2])
+    assert not same(actors[2], actors[3])
+    assert not same(critics[0], critics[1]) and not same(critics[1], critics[2])
 
 
 def test_statistics_are_those_of_all_valid_samples():

@@ -11,11 +11,12 @@ import jax
 import numpy as np
 import pytest
 
-from cref_jax import config, learn, runs, train
+from cref_jax import config, exported, learn, runs, train
 from cref_jax.checkpoint import Checkpoints
 
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
 TINY += ["--no-tensorboard", "--no-evaluate"]
+BUNDLED = str(exported.bundled())
 
 
 def run(folder: Path, *more: str) -> None:
@@ -44,6 +45,11 @@ def state_of(folder: Path) -> list[np.ndarray]:
         (["--iterations", "-3"], "'run.iterations' must be at least 1"),
         (["--physics.timestep", "1.0"], "'physics.timestep' must be"),
         (["--resume", "--run-dir", "nowhere"], "nowhere is not a run"),
+        (["--init", "nowhere"], "nowhere is not a run"),
+        (
+            ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],
+            "gru is 256, and here 9; set",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(
@@ -102,6 +108,24 @@ def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, vari
     log = [json.loads(line) for line in (tmp_path / "halves" / "log.jsonl").open()]
     assert [line["iteration"] for line in log] == [1, 2, 3, 4]
     assert len((tmp_path / "halves" / "origin.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.slow
+def test_a_run_begins_as_a_policy_whose_critic_is_gone(tmp_path: Path):
+    run(tmp_path / "first")
+    world = runs.world_of(runs.read_config(tmp_path / "first"))
+    exported.write(runs.load_policy(tmp_path / "first", world), world, tmp_path / "policy")
+    policy = exported.read(tmp_path / "policy")
+    run(tmp_path / "second", "--init", str(tmp_path / "policy"), "--iterations", "1")
+    assert runs.read_config(tmp_path / "second").ppo.critic_first == 20
+    begun = runs.load_policy(tmp_path / "second", world).train
+    for a, b in zip(*(jax.tree.leaves(t.params.actor) for t in (policy.train, begun)), strict=True):
+        np.testing.assert_array_equal(a, b)  # the critic alone has learned
+    # 2 x 8 x 24 samples were seen before, and as many in half again
+    seen = begun.statistics.obs
+    assert int(seen.count) == 576
+    drift = np.abs(seen.mean - policy.train.statistics.obs.mean)
+    assert np.all(drift < 2.0 * np.asarray(seen.std) + 1e-3)
 
 
 @pytest.mark.slow
