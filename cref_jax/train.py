@@ -48,7 +48,8 @@ class Options:
     run_dir: Path | None = None
     """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
     init: Path | None = None
-    """an exported policy or a run, as which this run's actor begins; first the critic learns alone"""
+    """an exported policy or a run, as which this run's actor begins; the critic learns alone first
+    """
     resume: bool = False
     """go on with the run in --run-dir, or with the newest one"""
     print_config: bool = False
