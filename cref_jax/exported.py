@@ -141,7 +141,9 @@ def read(path: Path, world: World | None = None) -> Policy:
 
 def digest(policy: Policy) -> str:
     """Return the SHA-256 of all that decides what a policy does, the same for run and export."""
-    found = hashlib.sha256(json.dumps(dataclasses.asdict(policy.config.network)).encode())
+    c = policy.config
+    settings = [dataclasses.asdict(part) for part in (c.network, c.robot, c.camera)]
+    found = hashlib.sha256(json.dumps(settings).encode())
     arrays = leaves.on_host(policy.train.params.actor["params"])
     seen = policy.train.statistics.obs
     for name, array in sorted({**arrays, "mean": seen.mean, "std": seen.std}.items()):
