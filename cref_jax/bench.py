@@ -190,10 +190,11 @@ def _iteration(options: Options) -> Row:
     """Return the time of a whole iteration of `make train`, as it is set up for this device."""
     device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     c = runs.composed(options.terrain, None, device)
-    world = runs.world_of(c, resolve_engine("auto"))
-    state = jax.jit(learn.initial_state)(world)
+    mesh = runs.mesh_of(c)
+    world = runs.world_of(c, resolve_engine("auto"), max(cli.cores() // mesh.size, 1))
+    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
     begun = time.perf_counter()
-    program = learn.chunk.lower(world, state, 1).compile()
+    program = learn.chunk.lower(world, state, mesh, 1).compile()
     compiled = time.perf_counter() - begun
     run = {"state": state}  # each call consumes the state that it is given
 

@@ -58,6 +58,12 @@ def prepare() -> None:
     """Set JAX up, before it is used for the first time."""
     _use_wide_registers()
     _use_compile_cache()
+    _use_every_core()
+
+
+def cores() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def _use_wide_registers() -> None:
@@ -81,6 +87,17 @@ def _use_compile_cache() -> None:
         return  # a read-only home costs time, nothing else
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+
+
+def _use_every_core() -> None:
+    """Let JAX count the CPU as one device a core, where nobody has said otherwise.
+
+    Robots that are shared out among four cores are trained half as fast again as by operations
+    that are each shared out.
+    """
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        with contextlib.suppress(RuntimeError):  # JAX is in use already
+            jax.config.update("jax_num_cpu_devices", cores())
 
 
 class StopRequest:

@@ -6,11 +6,12 @@ means the same alone as in a batch. A program calls an engine by its number, whi
 order in which a process makes its engines: so a program in the cache fits the next process, too.
 """
 
-import functools
+import collections
+import contextlib
 import itertools
 import os
-import threading
 import weakref
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -53,14 +54,10 @@ class HostEngine:
         """Take the compiled model with one force sensor a foot, and the trunk's body number."""
         self._model = model
         self._trunk = trunk
-        self._threads = threads or os.cpu_count() or 1
+        self._threads = threads or len(os.sched_getaffinity(0))
         self._number = next(_NUMBERS)
         _ENGINES[self._number] = self
-        self._batch = functools.lru_cache(maxsize=4)(self._make_batch)
-        self._lock = threading.Lock()  # several devices may call at once, for the same simulations
-
-    def _make_batch(self, count: int) -> "_Simulations":
-        return _Simulations(self._model, self._trunk, count, min(self._threads, count))
+        self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
 
     def substep(
         self,
@@ -97,9 +94,20 @@ class HostEngine:
         count = int(np.prod(lead, dtype=int))
         flat = [x.reshape(count, *x.shape[len(lead) :]) for x in state]
         varied = Dynamics(*(x.reshape(count, *x.shape[len(lead) :]) for x in dynamics))
-        with self._lock:
-            result = self._batch(count).step(flat, varied)
+        with self._simulations(count) as simulations:
+            result = simulations.step(flat, varied)
         return Substep(*(x.reshape(*lead, *x.shape[1:]) for x in result))
+
+    @contextlib.contextmanager
+    def _simulations(self, count: int) -> Iterator["_Simulations"]:
+        """Lend out `count` simulations: several devices may step robots at the same time."""
+        idle = self._idle[count]
+        try:
+            found = idle.pop()
+        except IndexError:
+            found = _Simulations(self._model, self._trunk, count, min(self._threads, count))
+        yield found
+        idle.append(found)
 
 
 def _substep(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:

@@ -36,6 +36,7 @@ class Atlas:
     kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
     columns: tuple[int, int] = flax.struct.field(pytree_node=False)  # of the grid, along, across
     is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # each kind: level across
+    turns: tuple[int, ...] = flax.struct.field(pytree_node=False)  # kinds that robots get in turn
 
     @property
     def levels(self) -> int:
@@ -51,6 +52,10 @@ class Atlas:
     def end(self) -> Float[ArrayLike, ""]:
         """Where a lane ends, m along it."""
         return self.terrain.origin[0] + self.length
+
+    def kind_of(self, robot: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """Return the kind of lane that the robots of these numbers are on."""
+        return np.asarray(self.turns)[robot % len(self.turns)]
 
     def tile(self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""]) -> Terrain:
         """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""
@@ -69,7 +74,8 @@ def build(c: config.Terrain) -> Atlas:
     _check_lane(c)
     numbers = _numbers(c.name)
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
-    return _atlas(c, numbers, sizes, [c.seed] * c.levels)
+    atlas = _atlas(c, numbers, sizes, [c.seed] * c.levels)
+    return atlas.replace(turns=_turns(c.name, atlas.kinds))
 
 
 def single(c: config.Terrain, kind: str, size: float) -> Atlas:
@@ -136,6 +142,7 @@ class _MixFile:
     """A terrain file that takes all kinds of other ones."""
 
     mix: tuple[str, ...]
+    shares: dict  # robots on each kind of a file, of those on a kind whose file is not named
 
 
 @dataclass(frozen=True)
@@ -170,6 +177,7 @@ def _atlas(
         kinds=tuple(numbers),
         columns=(along, across),
         is_profile=tuple(bool((h == h[..., :1]).all()) for h in np.moveaxis(heights, 2, 0)),
+        turns=tuple(range(len(numbers))),
     )
 
 
@@ -191,11 +199,33 @@ def _numbers(name: str) -> dict[str, _Numbers]:
     if "mix" not in table:
         return _kinds(table, where)
     numbers: dict[str, _Numbers] = {}
-    for part in _record(_MixFile, table, where).mix:
+    for part in _mix(table, where).mix:
         numbers |= _kinds(*_table(part))
     if not numbers:
         raise ConfigError(f"{where}: mix must name at least one terrain")
     return numbers
+
+
+def _turns(name: str, kinds: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the kinds that robots are put on in turn, as often as the terrain's shares ask for."""
+    table, where = _table(name)
+    share = dict.fromkeys(kinds, 1)
+    if "mix" in table:
+        for part, count in _mix(table, where).shares.items():
+            share |= dict.fromkeys(_kinds(*_table(part)), count)
+    rounds = range(max(share.values()))
+    return tuple(k for r in rounds for k, kind in enumerate(kinds) if r < share[kind])
+
+
+def _mix(table: dict[str, Any], where: str) -> _MixFile:
+    """Return what a terrain file says that takes all kinds of other ones."""
+    file = _record(_MixFile, {"shares": {}} | table, where)
+    for part, count in file.shares.items():
+        if part not in file.mix:
+            raise ConfigError(f"{where}: shares names '{part}', which is not in mix")
+        if not isinstance(count, int) or count < 1:
+            raise ConfigError(f"{where}: the share of '{part}' must be 1, 2, ..., not {count}")
+    return file
 
 
 def _table(name: str) -> tuple[dict[str, Any], str]:
@@ -285,7 +315,7 @@ def _own_map(path: Path) -> Atlas:
     origin = (MAP_START - file.start[0], -file.start[1])
     grid = terrain.from_heights(heights.astype(np.float32), file.cell, origin)
     is_profile = bool((heights == heights[:, :1]).all())
-    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,))
+    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,), (0,))
 
 
 def _array(path: Path) -> np.ndarray:

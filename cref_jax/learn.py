@@ -2,6 +2,9 @@
 
 An iteration is a horizon of experience and an update. Its random numbers come from the seed and the
 number of the iteration, so neither the length of a chunk nor a resumption changes any result.
+
+The robots are shared out among the devices of a mesh. Each collects and learns from its own, and
+they agree on every gradient, so that all of them hold the same parameters.
 """
 
 import functools
@@ -10,12 +13,16 @@ from typing import no_type_check
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Float, PyTree
 
 from cref_jax import ppo, rollout
 from cref_jax.world import World
 
 Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
+
+AXIS = "robots"  # of the mesh
 
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
@@ -27,44 +34,100 @@ class RunState:
     robots: rollout.Robots
 
 
-def initial_state(world: World) -> RunState:
-    """Return the state before the first iteration."""
-    c = world.config
+def mesh_of(count: int = 1) -> Mesh:
+    """Return the first `count` devices."""
+    devices = jax.devices()[:count]
+    return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
+    """Return the state before the first iteration; without a mesh, for one device."""
+    c, mesh = world.config, mesh or mesh_of()
     key_robots, key_params = jax.random.split(jax.random.key(c.run.seed))
-    robots = rollout.start(world, key_robots, c.run.num_envs)
+
+    def start(world: World, key: Array) -> rollout.Robots:
+        return rollout.start(world, _own(key), c.run.num_envs // mesh.size)
+
+    shared = jax.shard_map(
+        start,
+        mesh=mesh,
+        in_specs=(P(), P()),
+        out_specs=_partition(world).robots,
+        check_vma=False,
+    )
+    robots = shared(world, key_robots)
     seen = robots.observation
     joints = len(world.physics.robot.joint_names)
     params = rollout.initial_params(c.network, joints, robots, key_params)
     sizes = seen.proprioception.shape[-1], seen.privileged.shape[-1]
-    return RunState(ppo.initial_state(params, *sizes, c.ppo), robots)
+    train = ppo.initial_state(params, *sizes, c.ppo)
+    return RunState(jax.lax.with_sharding_constraint(train, NamedSharding(mesh, P())), robots)
 
 
-@functools.partial(jax.jit, static_argnames="iterations", donate_argnums=1)
-def chunk(world: World, state: RunState, iterations: int) -> tuple[RunState, Log]:
+def shapes(world: World, mesh: Mesh) -> RunState:
+    """Return the shapes of a run's state and how it is shared out, without an array."""
+
+    def shared(spec: P, part: PyTree) -> PyTree:
+        place = NamedSharding(mesh, spec)
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), part)
+
+    state = jax.eval_shape(functools.partial(initial_state, mesh=mesh), world)
+    return jax.tree.map(shared, _partition(world), state, is_leaf=lambda x: isinstance(x, P))
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "iterations"), donate_argnames="state")
+def chunk(world: World, state: RunState, mesh: Mesh, iterations: int) -> tuple[RunState, Log]:
     """Run `iterations` iterations; every entry of the log is [iterations]."""
     key = jax.random.fold_in(jax.random.key(world.config.run.seed), 1)
 
     def iteration(state: RunState, _: None) -> tuple[RunState, Log]:
-        return _iteration(world, state, jax.random.fold_in(key, state.train.iteration))
+        return _iteration(world, state, mesh, jax.random.fold_in(key, state.train.iteration))
 
     return jax.lax.scan(iteration, state, None, length=iterations)
 
 
-def _iteration(world: World, state: RunState, key: Array) -> tuple[RunState, Log]:
+def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[RunState, Log]:
     c = world.config
     nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
-    key_act, key_update = jax.random.split(key)
-    robots, experience, trace = rollout.collect(world, nets, state.train, state.robots, key_act)
-    train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions)
+
+    def learn(
+        world: World, state: RunState, key: Array
+    ) -> tuple[RunState, ppo.Losses, rollout.Trace]:
+        key_act, key_update = jax.random.split(_own(key))
+        robots, experience, trace = rollout.collect(world, nets, state.train, state.robots, key_act)
+        train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions, AXIS)
+        return RunState(train, robots), losses, trace
+
+    parts = _partition(world)
+    shared = jax.shard_map(
+        learn,
+        mesh=mesh,
+        in_specs=(P(), parts, P()),
+        out_specs=(parts, P(), P(None, AXIS)),
+        check_vma=False,
+    )
+    std = jnp.exp(state.train.params.actor["params"]["log_std"])
+    state, losses, trace = shared(world, state, key)
+    samples = state.train.iteration * (c.run.num_envs * c.ppo.horizon)
     log = {
         **_episodes(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
-        "train/action_std": jnp.exp(experience.log_std[0, 0]).mean(),
-        "train/samples": (train.iteration * (c.run.num_envs * c.ppo.horizon)).astype(jnp.float32),
+        "train/action_std": std.mean(),
+        "train/samples": samples.astype(jnp.float32),
     }
-    return RunState(train, robots), log
+    return state, log
+
+
+def _partition(world: World) -> RunState:
+    """Return how a run's state is shared out: the robots are, and what is learned is not."""
+    return RunState(train=P(), robots=rollout.partition(AXIS, world.config.network.variant))
+
+
+def _own(key: Array) -> Array:
+    """Return this device's own key."""
+    return jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
 
 def _episodes(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:

@@ -7,7 +7,6 @@ Samples that are not `valid` count in no loss and in no statistic, whatever they
 
 import contextlib
 import io
-import math
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, no_type_check
 
@@ -17,7 +16,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
 
-from cref_jax import config
+from cref_jax import config, gaussian
 
 with contextlib.redirect_stdout(
     io.StringIO()
@@ -150,16 +149,24 @@ def optimiser(c: config.PPO) -> optax.GradientTransformationExtraArgs:
 
 
 def update(
-    state: TrainState, rollout: Rollout, key: PRNGKeyArray, c: config.PPO, networks: Networks
+    state: TrainState,
+    rollout: Rollout,
+    key: PRNGKeyArray,
+    c: config.PPO,
+    networks: Networks,
+    axis: str | None = None,
 ) -> tuple[TrainState, Losses]:
     """Learn from one rollout; the losses are [epochs, minibatches].
 
     The rollout is normalised by the statistics that it was made with. They learn of it at the end.
+    With an `axis` this is one of several devices, each with a rollout of its own: they agree on
+    every gradient, and learn as one device would from all the rollouts.
     """
-    batch = judge(state.statistics, rollout, c)
+    batch = judge(state.statistics, rollout, c, axis)
 
     def on_batch(state: TrainState, batch: Batch) -> tuple[TrainState, Losses]:
-        grads, losses = jax.grad(loss, has_aux=True)(state.params, batch, c, networks)
+        grads, losses = jax.grad(loss, has_aux=True)(state.params, batch, c, networks, axis)
+        grads, losses = _agreed((grads, losses), axis)
         return _descend(state, grads, losses, c)
 
     def on_epoch(state: TrainState, key: PRNGKeyArray) -> tuple[TrainState, Losses]:
@@ -167,13 +174,15 @@ def update(
 
     state, losses = jax.lax.scan(on_epoch, state, jax.random.split(key, c.epochs))
     statistics = Statistics(
-        obs=observe(state.statistics.obs, rollout.obs, rollout.valid),
-        critic_obs=observe(state.statistics.critic_obs, rollout.critic_obs, rollout.valid),
+        obs=observe(state.statistics.obs, rollout.obs, rollout.valid, axis),
+        critic_obs=observe(state.statistics.critic_obs, rollout.critic_obs, rollout.valid, axis),
     )
     return state.replace(statistics=statistics, iteration=state.iteration + 1), losses
 
 
-def judge(statistics: Statistics, rollout: Rollout, c: config.PPO) -> Batch:
+def judge(
+    statistics: Statistics, rollout: Rollout, c: config.PPO, axis: str | None = None
+) -> Batch:
     """Return the rollout with advantages and returns, normalised.
 
     An invalid step has the advantage 0 and passes none on: the steps before it are judged as if the
@@ -189,8 +198,9 @@ def judge(statistics: Statistics, rollout: Rollout, c: config.PPO) -> Batch:
         c.gamma,
         c.lam,
     )
-    centred = advantage - _mean(advantage, clean.valid)
-    deviation = jnp.sqrt(_mean(jnp.square(centred), clean.valid))
+    mean = lambda x: _agreed(_mean(x, clean.valid, axis), axis)
+    centred = advantage - mean(advantage)
+    deviation = jnp.sqrt(mean(jnp.square(centred)))
     return Batch(
         obs=normalise(statistics.obs, clean.obs),
         critic_obs=normalise(statistics.critic_obs, clean.critic_obs),
@@ -250,23 +260,24 @@ def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:
 
 
 def loss(
-    params: Params, batch: Batch, c: config.PPO, networks: Networks
+    params: Params, batch: Batch, c: config.PPO, networks: Networks, axis: str | None = None
 ) -> tuple[Float[Array, ""], Losses]:
-    """Return the weighted loss of a minibatch, and its parts."""
+    """Return the weighted loss of a minibatch, and its parts; `axis` is as in `_mean`."""
+    mean = lambda x: _mean(x, batch.valid, axis)
     _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins, batch.sight)
     value = networks.critic(params.critic, batch.critic_obs)
-    new = log_prob(batch.action, policy.mean, policy.log_std)
-    old = log_prob(batch.action, batch.mean, batch.log_std)
+    new = gaussian.log_prob(batch.action, policy.mean, policy.log_std)
+    old = gaussian.log_prob(batch.action, batch.mean, batch.log_std)
     ratio = jnp.exp(jnp.where(batch.valid, new - old, 0.0))
-    divergence = kl(batch.mean, batch.log_std, policy.mean, policy.log_std)
+    divergence = gaussian.kl(batch.mean, batch.log_std, policy.mean, policy.log_std)
     error = jnp.sum(jnp.square(policy.velocity - batch.velocity), axis=-1)
     parts = Losses(
-        surrogate=_mean(surrogate(ratio, batch.advantage, c.clip), batch.valid),
-        value=_mean(value_error(value, batch.value, batch.returns, c.value_clip), batch.valid),
-        velocity=_mean(error, batch.valid),
-        entropy=entropy(policy.log_std),
-        kl=_mean(divergence, batch.valid),
-        clipped=_mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype), batch.valid),
+        surrogate=mean(surrogate(ratio, batch.advantage, c.clip)),
+        value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),
+        velocity=mean(error),
+        entropy=gaussian.entropy(policy.log_std),
+        kl=mean(divergence),
+        clipped=mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype)),
     )
     total = (
         parts.surrogate
@@ -295,34 +306,6 @@ def value_error(
     return jnp.maximum(jnp.square(value - returns), jnp.square(held - returns))
 
 
-def log_prob(
-    x: Float[Array, "*n J"], mean: Float[Array, "*n J"], log_std: Float[Array, "*#n J"]
-) -> Float[Array, "*n"]:
-    """Return log N(x; mean, std^2), summed over the independent coordinates."""
-    z = (x - mean) * jnp.exp(-log_std)
-    return -jnp.sum(0.5 * jnp.square(z) + log_std + 0.5 * math.log(2.0 * math.pi), axis=-1)
-
-
-def entropy(log_std: Float[Array, " J"]) -> Float[Array, ""]:
-    """Return the entropy of a Gaussian, sum of log std + log(2 pi e) / 2, in nats."""
-    return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
-
-
-def kl(
-    mean: Float[Array, "*n J"],
-    log_std: Float[Array, "*n J"],
-    new_mean: Float[Array, "*n J"],
-    new_log_std: Float[Array, " J"],
-) -> Float[Array, "*n"]:
-    """Return KL(old || new) of two Gaussians, in nats.
-
-    sum of log(s'/s) + (s^2 + (m - m')^2) / (2 s'^2) - 1/2
-    """
-    growth = new_log_std - log_std
-    shift = (mean - new_mean) * jnp.exp(-new_log_std)
-    return jnp.sum(growth + 0.5 * (jnp.exp(-2.0 * growth) + jnp.square(shift) - 1.0), axis=-1)
-
-
 def adapt(rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO) -> Float[Array, ""]:
     """Return the learning rate, lower if the policy moved too far and higher if not far enough.
 
@@ -341,12 +324,16 @@ def normalise(statistics: RunningStatisticsState, x: Float[Array, "*n O"]) -> Fl
 
 
 def observe(
-    statistics: RunningStatisticsState, x: Float[Array, "T E O"], valid: Bool[Array, "T E"]
+    statistics: RunningStatisticsState,
+    x: Float[Array, "T E O"],
+    valid: Bool[Array, "T E"],
+    axis: str | None = None,
 ) -> RunningStatisticsState:
-    """Return the statistics with the valid samples counted in."""
-    clean = jnp.where(valid[..., None], x, 0.0)
-    after = running_statistics.update(statistics, clean, weights=valid.astype(x.dtype))
-    return jax.tree.map(lambda new, old: jnp.where(valid.any(), new, old), after, statistics)
+    """Return the statistics with the valid samples, of all devices, counted in."""
+    clean, weights = jnp.where(valid[..., None], x, 0.0), valid.astype(x.dtype)
+    after = running_statistics.update(statistics, clean, weights=weights, pmap_axis_name=axis)
+    some = _agreed(weights.mean(), axis) > 0.0
+    return jax.tree.map(lambda new, old: jnp.where(some, new, old), after, statistics)
 
 
 def _descend(
@@ -372,9 +359,20 @@ def _descend(
     )
 
 
-def _mean(x: Float[Array, "T E"], valid: Bool[Array, "T E"]) -> Float[Array, ""]:
-    """Return the mean over the valid samples, 0 if there are none."""
-    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+def _mean(
+    x: Float[Array, "T E"], valid: Bool[Array, "T E"], axis: str | None = None
+) -> Float[Array, ""]:
+    """Return the mean over the valid samples, 0 if there are none.
+
+    With an `axis`, what `_agreed` makes the mean over the samples of all devices.
+    """
+    count = _agreed(jnp.sum(valid).astype(x.dtype), axis)
+    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.where(count > 0.0, count, 1.0)
+
+
+def _agreed(x: PyTree, axis: str | None) -> PyTree:
+    """Return the mean over the devices."""
+    return x if axis is None else jax.lax.pmean(x, axis)
 
 
 def _zero_invalid(rollout: Rollout) -> Rollout:

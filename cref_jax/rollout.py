@@ -11,6 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
 from cref_jax import config, depth, env, episode, network, ppo
@@ -83,6 +84,18 @@ class Trace(NamedTuple):
     measures: env.Measures
 
 
+def partition(axis: str, variant: config.Variant) -> Robots:
+    """Return which axis of each array is that of the robots, named `axis`; clocks have none."""
+    sees, robots = variant != "blind", P(axis)
+    return Robots(
+        env=robots,
+        observation=robots,
+        memory=Memory(robots, P(None, axis) if sees else None),
+        begins=robots,
+        feed=Feed(frame=robots, seen=robots, fresh=P(), clock=P()) if sees else None,
+    )
+
+
 def networks(c: config.Network, num_actions: int) -> Networks:
     """Return the actor and the critic."""
     return Networks(network.Actor(c, num_actions), network.Critic(c))
@@ -109,7 +122,7 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
     """Put E robots on their lanes: kinds in turn, low levels at random, episodes out of step."""
     c = world.config
     key_level, key_reset, key_see, key_step = jax.random.split(key, 4)
-    kinds = jnp.arange(num_envs) % len(world.lanes.kinds)
+    kinds = jnp.asarray(world.lanes.kind_of(np.arange(num_envs)))
     highest = min(c.curriculum.start_level, world.lanes.levels - 1)
     levels = jax.random.randint(key_level, (num_envs,), 0, highest + 1)
     split = lambda k: jax.random.split(k, num_envs)
@@ -170,7 +183,7 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E H W"]:
     `start` puts the robots on the kinds of lane in turn, for good: so it is known beforehand which
     of them stand on lanes that are level across, and these images cost an eighth.
     """
-    kinds = np.arange(state.kind.shape[0]) % len(world.lanes.kinds)
+    kinds = world.lanes.kind_of(np.arange(state.kind.shape[0]))
     is_profile = np.asarray(world.lanes.is_profile)[kinds]
     robots, images = [], []
     for flag in (True, False):

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from cref_jax import config, learn, ppo
 from cref_jax.checkpoint import Checkpoints
@@ -139,16 +140,39 @@ def checkpoints(run: Path, keep: int = 3) -> Checkpoints:
     return Checkpoints(run / "checkpoints", keep)
 
 
-def world_of(c: Config, engine: EngineName = "auto") -> World:
-    """Return the world that a configuration describes."""
-    return make_world(c, Physics(c.robot, c.physics, resolve_engine(engine)))
+def world_of(c: Config, engine: EngineName = "auto", threads: int = 0) -> World:
+    """Return the world that a configuration describes; `threads` is as in Physics."""
+    return make_world(c, physics_of(c, engine, threads))
 
 
-def check_memory(program: jax.stages.Compiled, num_envs: int) -> int:
-    """Return the bytes that a program takes while it runs, its arguments included.
+def physics_of(c: Config, engine: EngineName = "auto", threads: int = 0) -> Physics:
+    """Return the physics that a configuration describes; `threads` is as in Physics."""
+    return Physics(c.robot, c.physics, resolve_engine(engine), threads)
+
+
+def mesh_of(c: Config, asked: int | None = None) -> Mesh:
+    """Return the devices that share a run's robots: as many as `asked`, or as are of use.
 
     Raises:
-        ConfigError: the device has less.
+        ConfigError: so many are not there, or the robots cannot be shared out among them.
+    """
+    there, parts = jax.device_count(), c.ppo.minibatches
+    even = [n for n in range(1, there + 1) if c.run.num_envs % (n * parts) == 0]
+    if asked is not None and asked not in even:
+        raise ConfigError(
+            f"--devices {asked}: {c.run.num_envs} robots in {parts} minibatches can be shared "
+            f"among {', '.join(map(str, even))} of the {there} devices here"
+        )
+    return learn.mesh_of(asked or even[-1])
+
+
+def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) -> int:
+    """Return the bytes that a program takes on a device while it runs, its arguments included.
+
+    Of a CPU, all `devices` have one memory.
+
+    Raises:
+        ConfigError: there is less.
     """
     m = program.memory_analysis()
     if m is None:  # a device that does not tell
@@ -157,6 +181,7 @@ def check_memory(program: jax.stages.Compiled, num_envs: int) -> int:
     needed += m.output_size_in_bytes - m.alias_size_in_bytes
     stats = jax.devices()[0].memory_stats()  # a CPU has none
     there = stats["bytes_limit"] if stats else _main_memory()
+    needed *= 1 if stats else devices
     if needed > there:
         fits = num_envs * there // needed
         raise ConfigError(

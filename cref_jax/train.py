@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import jax
 import numpy as np
 import tyro
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cref_jax import cli, config, evaluation, exported, learn, runs
 from cref_jax.checkpoint import Checkpoints, lock
@@ -45,6 +46,8 @@ class Options:
     """mujoco steps on the CPU, mjx on the device"""
     device: Device = "auto"
     """where the program runs; gpu is an error without one"""
+    devices: int | None = None
+    """how many share the robots; as many as there are when left out, and of a CPU one a core"""
     run_dir: Path | None = None
     """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
     init: Path | None = None
@@ -129,7 +132,12 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
     run = options.run_dir or runs.ROOT / _name(options)
-    world = runs.world_of(c, options.engine)  # refuses a wrong terrain before anything is written
+    mesh = runs.mesh_of(c, options.devices)
+    threads = max(cli.cores() // mesh.size, 1)
+    # what is wrong with the terrain is said before anything is written
+    world = jax.device_put(
+        runs.world_of(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
+    )
     with lock(run):
         with runs.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
@@ -138,20 +146,20 @@ def train(options: Options, c: Config) -> None:
             samples = c.run.num_envs * c.ppo.horizon
             with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
                 report.say(_headline(run, c, options, first))
-                programs = _Programs(world, report)
+                programs = _Programs(world, mesh, report)
                 if first < c.run.iterations:
                     programs.of(min(c.run.chunk, c.run.iterations - first))
-                state = _first_state(world, steps, options)
+                state = _first_state(world, mesh, steps, options)
                 state = _loop(world, state, steps, report, programs)
-        _summary(run, world, state, options.evaluate)
+        _summary(run, c, state, options)
 
 
 class _Programs:
     """The compiled programs of chunks of iterations."""
 
-    def __init__(self, world: World, report: Reporter) -> None:
-        self._world, self._report = world, report
-        self._shapes = jax.eval_shape(learn.initial_state, world)
+    def __init__(self, world: World, mesh: Mesh, report: Reporter) -> None:
+        self._world, self.mesh, self._report = world, mesh, report
+        self._shapes = learn.shapes(world, mesh)
         self._of: dict[int, jax.stages.Compiled] = {}
 
     def of(self, size: int) -> jax.stages.Compiled:
@@ -167,10 +175,12 @@ class _Programs:
                     "compiling (half a minute on four cores, seconds from the cache) ..."
                 )
             begun = time.monotonic()
-            self._of[size] = learn.chunk.lower(self._world, self._shapes, size).compile()
+            lowered = learn.chunk.lower(self._world, self._shapes, self.mesh, size)
+            self._of[size] = lowered.compile()
             if first:
                 seconds = time.monotonic() - begun
-                needed = runs.check_memory(self._of[size], self._world.config.run.num_envs)
+                robots = self._world.config.run.num_envs
+                needed = runs.check_memory(self._of[size], robots, self.mesh.size)
                 self._report.say(
                     f"compiled in {seconds:.0f} s; it takes {needed / 2**30:.1f} GiB of memory; "
                     "Ctrl-C saves and stops"
@@ -202,9 +212,9 @@ def _loop(
             _check_health(log, c.run.num_envs * c.ppo.horizon)
             done = int(state.train.iteration)
             if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
-                _save(steps, state, done)
+                _save(steps, state, done, programs.mesh)
                 saved = time.monotonic()
-        _save(steps, state, done)
+        _save(steps, state, done, programs.mesh)
     if stop.asked:
         report.say(f"stopped and saved at iteration {done}")
     return state
@@ -224,24 +234,31 @@ def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
     return latest or 0
 
 
-def _first_state(world: World, steps: Checkpoints, options: Options) -> learn.RunState:
+def _first_state(world: World, mesh: Mesh, steps: Checkpoints, options: Options) -> learn.RunState:
     """Return the state to begin with: fresh, with a policy's actor, or of the newest checkpoint."""
-    state = jax.jit(learn.initial_state)(world)
+    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
     if options.init:
         return state.replace(train=exported.begun(state.train, exported.load(options.init, world)))
     if not options.resume:
         return state
-    stored = steps.meta()["num_envs"]
-    if stored == world.config.run.num_envs:
+    stored, here = steps.meta(), _sharing(state, mesh)
+    there = {name: stored.get(name, 1) for name in here}
+    if there == here:
         return steps.restore(state)[0]
-    print(f"the number of robots changes from {stored} to {world.config.run.num_envs}: what was")
-    print("learned is kept, the robots start anew, and the run is no longer the same bit for bit")
+    for name, count in here.items():
+        if there[name] != count:
+            print(f"{name} changes from {there[name]} to {count}")
+    print("so what was learned is kept, the robots start anew, and the run is no longer the same")
     return steps.restore(state, parts=("train",))[0]
 
 
-def _save(steps: Checkpoints, state: learn.RunState, done: int) -> None:
-    robots = state.robots.begins.shape[0]
-    steps.save(done, state, {"num_envs": robots})
+def _save(steps: Checkpoints, state: learn.RunState, done: int, mesh: Mesh) -> None:
+    steps.save(done, state, _sharing(state, mesh))
+
+
+def _sharing(state: learn.RunState, mesh: Mesh) -> dict[str, int]:
+    """Return how the robots are shared out; each device has the kinds of lane in turn."""
+    return {"num_envs": state.robots.begins.shape[0], "shares": mesh.size}
 
 
 def _check_health(log: Mapping[str, np.ndarray], samples: int) -> None:
@@ -269,10 +286,12 @@ def _headline(run: Path, c: Config, options: Options, first: int) -> str:
     )
 
 
-def _summary(run: Path, world: World, state: learn.RunState, evaluate: bool) -> None:
+def _summary(run: Path, c: Config, state: learn.RunState, options: Options) -> None:
     """Say what was learned and what to type next."""
-    if evaluate:
-        result = evaluation.walk(world.config, world.physics, state.train)
+    if options.evaluate:
+        physics = runs.physics_of(c, options.engine)
+        one = jax.device_put(state.train, jax.devices()[0])
+        result = evaluation.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')
 

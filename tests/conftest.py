@@ -17,6 +17,7 @@ import pytest
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    jax.config.update("jax_num_cpu_devices", 2)
     # Most of the suite's time is compilation. The cache is the user's own: it holds machine code.
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cref_jax" / "tests"
     try:

@@ -28,14 +28,14 @@ def world() -> World:
 @functools.cache
 def resets() -> EnvState:
     """Return 512 robots at their start, of every kind and level in turn."""
-    number = jnp.arange(512)
-    kinds, levels = number % len(world().lanes.kinds), number // len(world().lanes.kinds) % 3
+    number, lanes = np.arange(512), world().lanes
+    kinds, levels = jnp.asarray(lanes.kind_of(number)), jnp.asarray(number // len(lanes.turns) % 3)
     reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
     return reset(world(), jax.random.split(jax.random.key(3), 512), kinds, levels)
 
 
 def robots() -> EnvState:
-    """Return eight robots, one a kind and two on level ground."""
+    """Return eight robots, one a kind and two on stairs up."""
     return one(resets(), np.arange(ROBOTS))
 
 

@@ -1,6 +1,7 @@
 """The lanes: what lies in them, in metres, and what is said about a file that cannot be used."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +53,30 @@ def test_mixed_holds_every_kind_once(mixed):
     assert mixed.columns == (600, 200)
     assert mixed.terrain.heights.shape == (6000, 1400)
     assert mixed.length == pytest.approx(12.0)
+
+
+def test_robots_are_put_on_the_kinds_in_turn_as_often_as_their_shares_ask_for(mixed):
+    # 7 kinds, 4 of them three times: 7 + 4 + 4 turns
+    assert mixed.turns == (0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 3, 4, 5, 6)
+    names = [mixed.kinds[k] for k in mixed.kind_of(np.arange(7, 17))]
+    stairs = ["stairs_up", "stairs_down"]
+    assert names == [*stairs, "gap", "platform"] * 2 + ["flat", "rough"]
+    assert lanes.build(config.Terrain(name="stairs")).turns == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("shares", "says"),
+    [
+        ("rough = 2", "shares names 'rough', which is not in mix"),
+        ("gap = 0", "the share of 'gap' must be 1, 2, ..., not 0"),
+        ("gap = 1.5", "the share of 'gap' must be 1, 2, ..., not 1.5"),
+    ],
+)
+def test_shares_that_mean_nothing_are_refused(shares, says, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(f'mix = ["flat", "gap"]\n[shares]\n{shares}\n')
+    with pytest.raises(config.ConfigError, match=re.escape(says)):
+        lanes.build(config.Terrain(name=str(file)))
 
 
 def test_sizes_run_evenly_from_the_lowest_to_the_highest_of_training(mixed):

@@ -10,7 +10,7 @@ import pytest
 from brax.training.agents.ppo.losses import compute_gae
 from jax.test_util import check_grads
 
-from cref_jax import config, network, ppo
+from cref_jax import config, gaussian, network, ppo
 
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
@@ -153,16 +153,16 @@ def test_log_prob_and_entropy_worked_by_hand():
     # x = (1, 0), m = (0, 0), s = (1, 2): -(1/2 + ln 1 + .918939) - (0 + ln 2 + .918939) = -3.031024
     # entropy: ln 1 + ln 2 + 2 * 1.418939 = 3.531024
     mean, log_std = jnp.zeros((1, 2)), jnp.log(jnp.array([1.0, 2.0]))
-    out = ppo.log_prob(jnp.array([[1.0, 0.0]]), mean, log_std)
+    out = gaussian.log_prob(jnp.array([[1.0, 0.0]]), mean, log_std)
     np.testing.assert_allclose(out, [-3.031024], rtol=1e-6)
-    np.testing.assert_allclose(ppo.entropy(log_std), 3.531024, rtol=1e-6)
+    np.testing.assert_allclose(gaussian.entropy(log_std), 3.531024, rtol=1e-6)
 
 
 def test_kl_worked_by_hand():
     # old (0, s 1), new (1, s 2): ln 2 + (1 + 1)/8 - 1/2 = .443147
     # old (1, s 2), new (1, s 2): 0.  The divergence of the pair is their sum.
     old_mean, old_log_std = jnp.array([[0.0, 1.0]]), jnp.log(jnp.array([[1.0, 2.0]]))
-    out = ppo.kl(old_mean, old_log_std, jnp.ones((1, 2)), jnp.log(jnp.array([2.0, 2.0])))
+    out = gaussian.kl(old_mean, old_log_std, jnp.ones((1, 2)), jnp.log(jnp.array([2.0, 2.0])))
     np.testing.assert_allclose(out, [0.443147], rtol=1e-5)
 
 
@@ -170,11 +170,11 @@ def test_kl_and_entropy_agree_with_sampling():
     mean, log_std = jnp.array([0.3, -1.0]), jnp.array([-0.5, 0.4])
     other, other_log_std = jnp.array([0.0, -0.5]), jnp.array([-0.2, 0.1])
     x = mean + jnp.exp(log_std) * jax.random.normal(jax.random.key(0), (200_000, 2))
-    p = ppo.log_prob(x, jnp.broadcast_to(mean, x.shape), log_std)
-    q = ppo.log_prob(x, jnp.broadcast_to(other, x.shape), other_log_std)
-    exact = ppo.kl(mean[None], log_std[None], other[None], other_log_std)[0]
+    p = gaussian.log_prob(x, jnp.broadcast_to(mean, x.shape), log_std)
+    q = gaussian.log_prob(x, jnp.broadcast_to(other, x.shape), other_log_std)
+    exact = gaussian.kl(mean[None], log_std[None], other[None], other_log_std)[0]
     np.testing.assert_allclose(jnp.mean(p - q), exact, atol=0.01)
-    np.testing.assert_allclose(-jnp.mean(p), ppo.entropy(log_std), atol=0.01)
+    np.testing.assert_allclose(-jnp.mean(p), gaussian.entropy(log_std), atol=0.01)
 
 
 class OneStep(NamedTuple):
@@ -424,6 +424,26 @@ def test_normalisation_is_bounded_and_undoes_scale():
     np.testing.assert_allclose(out.mean((0, 1)), 0.0, atol=1e-3)
     np.testing.assert_allclose(out.std((0, 1)), 1.0, rtol=1e-3)
     assert float(ppo.normalise(statistics, jnp.full((1, OBS), 1e9)).max()) == ppo.OBSERVATION_CLIP
+
+
+def test_devices_that_share_the_robots_learn_what_one_would():
+    # one minibatch, since each device draws its own; invalid samples, as many as chance has it
+    one = dataclasses.replace(C, epochs=2, minibatches=1)
+    whole = some_rollout()
+    valid = jax.random.bernoulli(jax.random.key(5), 0.7, (T, E)).at[:, : E // 2].set(True)
+    whole = whole._replace(valid=valid)
+    halves = jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2, axis=1), 0), whole._replace(carry=()))
+    carry = jax.tree.map(lambda x: jnp.stack(jnp.split(x, 2)), whole.carry)
+    learn = lambda rollout: ppo.update(
+        initial_state(), rollout, jax.random.key(0), one, NETWORKS, "devices"
+    )
+    shared = jax.jit(jax.vmap(learn, axis_name="devices"))(halves._replace(carry=carry))
+    alone = jax.jit(ppo.update, static_argnums=(3, 4))(
+        initial_state(), whole, jax.random.key(0), one, NETWORKS
+    )
+    for device in range(2):
+        mine = jax.tree.map(lambda x, device=device: x[device], shared)
+        assert_same(mine, alone, rtol=2e-4, atol=2e-5)
 
 
 def test_an_update_runs_inside_a_scan():

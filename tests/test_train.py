@@ -48,7 +48,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
         (["--init", "nowhere"], "nowhere is not a run"),
         (
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],
-            "gru is 256, and here 9; set",
+            "has another network: ",
         ),
     ],
 )
@@ -134,9 +134,43 @@ def test_a_run_goes_on_with_another_number_of_robots_and_keeps_what_it_learned(
 ):
     run(tmp_path / "run")
     run(tmp_path / "run", "--iterations", "3", "--num-envs", "4", "--resume")
-    assert "the number of robots changes from 8 to 4" in capsys.readouterr().out
+    assert "num_envs changes from 8 to 4" in capsys.readouterr().out
     with Checkpoints(tmp_path / "run" / "checkpoints") as steps:
         assert steps.latest() == 3
+
+
+@pytest.mark.slow
+def test_devices_share_the_robots_and_hold_the_same_parameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run(tmp_path / "two", "--devices", "2")
+    c = runs.read_config(tmp_path / "two")
+    mesh = runs.mesh_of(c)
+    world = runs.world_of(c)
+    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
+    assert [s.data.shape[0] for s in state.robots.begins.addressable_shards] == [4, 4]
+    first, second = (s.data for s in state.robots.env.body.qpos.addressable_shards)
+    assert not np.array_equal(first, second), "each device has its own random numbers"
+    state, log = learn.chunk(world, state, mesh, 2)
+    for leaf in jax.tree.leaves(state.train):
+        shards = [np.asarray(s.data) for s in leaf.addressable_shards]
+        np.testing.assert_array_equal(*shards)
+    lines = [json.loads(line) for line in (tmp_path / "two" / "log.jsonl").open()]
+    # the same run on the command line, of which the log has six digits
+    np.testing.assert_allclose(log["walk/reward"], [x["walk/reward"] for x in lines], rtol=1e-5)
+    capsys.readouterr()
+    run(tmp_path / "two", "--devices", "1", "--iterations", "3", "--resume")
+    assert "shares changes from 2 to 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("asked", ["3", "0"])
+def test_robots_that_cannot_be_shared_out_are_refused(
+    asked: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path / "run", "--devices", asked)
+    said = "8 robots in 2 minibatches can be shared among 1, 2 of the 2 devices here"
+    assert end.value.code == 2 and said in capsys.readouterr().err
 
 
 @pytest.mark.slow
