@@ -5,9 +5,12 @@ process is a fresh interpreter, since JAX does not survive a fork, and makes its
 """
 
 import concurrent.futures
+import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from rich.progress import track
@@ -38,9 +41,15 @@ def run(
         count, multiprocessing.get_context("spawn"), _begin, (make, arguments)
     )
     try:
-        return shown(pool.map(_work, jobs))
-    finally:  # Ctrl-C does not wait for those that have not begun
-        pool.shutdown(wait=False, cancel_futures=True)
+        with _without_interrupts():
+            futures = [pool.submit(_work, job) for job in jobs]
+        return shown(future.result() for future in futures)
+    except BaseException:  # such as Ctrl-C, which does not wait for the others
+        for child in multiprocessing.active_children():
+            child.kill()
+        raise
+    finally:
+        pool.shutdown()
 
 
 _worker: Callable[[Any], Any] | None = None  # of this process
@@ -48,7 +57,26 @@ _worker: Callable[[Any], Any] | None = None  # of this process
 
 def _begin(make: Callable[..., Callable[[Any], Any]], arguments: tuple[Any, ...]) -> None:
     global _worker
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker = make(*arguments)
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the process that made this one: after Ctrl-C nobody else tells it."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from the processes that are made here: each would print a traceback."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(job: Any) -> Any:
