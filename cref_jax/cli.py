@@ -72,9 +72,8 @@ def _use_wide_registers() -> None:
         wide = "avx512f" in Path("/proc/cpuinfo").read_text()
     except OSError:
         wide = False
-    flags = os.environ.get("XLA_FLAGS", "")
-    if wide and "xla_cpu_prefer_vector_width" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()
+    if wide:
+        _flag("xla_cpu_prefer_vector_width", 512)
 
 
 def _use_compile_cache() -> None:
@@ -95,9 +94,19 @@ def _use_every_core() -> None:
     Robots that are shared out among four cores are trained half as fast again as by operations
     that are each shared out.
     """
-    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+    _flag("xla_cpu_collective_call_terminate_timeout_seconds", 10**6)  # it may have to wait long,
+    _flag("xla_cpu_collective_call_warn_stuck_timeout_seconds", 600)  # as on a laptop that slept
+    chosen = jax.config.jax_num_cpu_devices > 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
+    if not chosen:
         with contextlib.suppress(RuntimeError):  # JAX is in use already
             jax.config.update("jax_num_cpu_devices", cores())
+
+
+def _flag(name: str, value: int) -> None:
+    """Set one of XLA's flags, where nobody has."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if name not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{name}={value}".strip()
 
 
 class StopRequest:

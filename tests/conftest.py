@@ -17,7 +17,7 @@ import pytest
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    jax.config.update("jax_num_cpu_devices", 2)
+    jax.config.update("jax_num_cpu_devices", 2)  # what is shared among devices, is among these
     # Most of the suite's time is compilation. The cache is the user's own: it holds machine code.
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cref_jax" / "tests"
     try:
@@ -54,3 +54,10 @@ def robots():
     import sample
 
     return sample.robots()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget_programs():
+    """Drop a module's compiled programs: Linux aborts a process of more than 65,530 mappings."""
+    yield
+    jax.clear_caches()
