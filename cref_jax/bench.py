@@ -30,6 +30,7 @@ from cref_jax import (
     learn,
     peers,
     ppo,
+    processes,
     rollout,
     runs,
 )
@@ -191,7 +192,7 @@ def _iteration(options: Options) -> Row:
     device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     c = runs.composed(options.terrain, None, device)
     mesh = runs.mesh_of(c)
-    world = runs.world_of(c, resolve_engine("auto"), max(cli.cores() // mesh.size, 1))
+    world = runs.world_of(c, resolve_engine("auto"), max(processes.cores() // mesh.size, 1))
     state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
     begun = time.perf_counter()
     program = learn.chunk.lower(world, state, mesh, 1).compile()

@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cref_jax import config, env, episode
@@ -157,9 +158,13 @@ def mend_brax() -> None:
     google/brax#671; where it is there, nothing happens.
     """
     if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = lambda tree, devices: jax.tree.map(  # type: ignore[attr-defined]
-            lambda x: jnp.stack([x] * len(devices)), tree
-        )
+        jax.device_put_replicated = _device_put_replicated  # type: ignore[attr-defined]
+
+
+def _device_put_replicated(tree: Any, devices: list[Any]) -> Any:
+    """Return the tree with a new first axis, one entry on each device."""
+    one_each = NamedSharding(Mesh(devices, ("devices",)), PartitionSpec("devices"))
+    return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), one_each), tree)
 
 
 def _obs(seen: Observation) -> dict[str, Array]:

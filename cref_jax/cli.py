@@ -10,6 +10,7 @@ from types import FrameType
 
 import jax
 
+from cref_jax import processes
 from cref_jax.checkpoint import CheckpointError
 from cref_jax.config import ConfigError
 
@@ -61,11 +62,6 @@ def prepare() -> None:
     _use_every_core()
 
 
-def cores() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 def _use_wide_registers() -> None:
     """Let XLA use 512 bits where the CPU has them: an update takes an eighth less time."""
     try:
@@ -99,7 +95,7 @@ def _use_every_core() -> None:
     chosen = jax.config.jax_num_cpu_devices > 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
     if not chosen:
         with contextlib.suppress(RuntimeError):  # JAX is in use already
-            jax.config.update("jax_num_cpu_devices", cores())
+            jax.config.update("jax_num_cpu_devices", processes.cores())
 
 
 def _flag(name: str, value: int) -> None:

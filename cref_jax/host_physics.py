@@ -9,7 +9,6 @@ order in which a process makes its engines: so a program in the cache fits the n
 import collections
 import contextlib
 import itertools
-import os
 import weakref
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco.batch import Batch
 
-from cref_jax import host_call
+from cref_jax import host_call, processes
 
 _TARGET = "cref_jax_mujoco_substep"
 _NUMBERS = itertools.count()
@@ -54,7 +53,7 @@ class HostEngine:
         """Take the compiled model with one force sensor a foot, and the trunk's body number."""
         self._model = model
         self._trunk = trunk
-        self._threads = threads or len(os.sched_getaffinity(0))
+        self._threads = threads or processes.cores()
         self._number = next(_NUMBERS)
         _ENGINES[self._number] = self
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)

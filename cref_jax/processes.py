@@ -19,6 +19,12 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 
+def cores() -> int:
+    """Return the cores that this process may use; macOS does not limit them."""
+    limited = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if limited else os.cpu_count() or 1
+
+
 def run(
     make: Callable[..., Callable[[J], R]],
     arguments: tuple[Any, ...],
@@ -33,7 +39,7 @@ def run(
         jobs: in the order of the results.
         count: of processes; one a core when left out; with 1 all is done in this one.
     """
-    count = min(count or os.cpu_count() or 1, len(jobs))
+    count = min(count or cores(), len(jobs))
     shown = lambda results: list(track(results, "walking", len(jobs), transient=True))
     if count == 1:
         return shown(map(make(*arguments), jobs))

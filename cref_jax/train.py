@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, config, evaluation, exported, learn, runs
+from cref_jax import cli, config, evaluation, exported, learn, processes, runs
 from cref_jax.checkpoint import Checkpoints, lock
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName, resolve_engine
@@ -133,7 +133,7 @@ def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
     run = options.run_dir or runs.ROOT / _name(options)
     mesh = runs.mesh_of(c, options.devices)
-    threads = max(cli.cores() // mesh.size, 1)
+    threads = max(processes.cores() // mesh.size, 1)
     # what is wrong with the terrain is said before anything is written
     world = jax.device_put(
         runs.world_of(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
