@@ -82,7 +82,9 @@ class Reward:
 
     weights: RewardWeights = field(default_factory=RewardWeights)
     times_dt: bool = True  # assumed: legged_gym's convention
-    event_time: float = 0.1  # s that a touchdown counts for then; assumed: for one control step, as
+    event_time: float = (
+        0.25  # s that a touchdown counts for then; assumed: for one control step, as
+    )
     # legged_gym has it, air time and footholds weigh too little to lengthen a step
     clip_at_zero: bool = True  # assumed: without it the negative sum at first teaches falling
     sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym
@@ -251,12 +253,16 @@ class PPO:
     value_weight: float = 1.0
     entropy_weight: float = 0.005
     estimator_weight: float = 1.0  # of the velocity estimator's L2 loss
+    readout_weight: float = 0.0  # of the loss of telling m_t by the actor's features; the paper: 0
     gamma: float = 0.99
     lam: float = 0.95
     learning_rate: float = 1e-3
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
     target_kl: float = 0.01
     max_gradient_norm: float = 1.0
+    average: int = (
+        200  # iterations, at most, over which the policy that is kept is averaged; assumed
+    )
     critic_first: int = 0  # iterations in which the critic alone learns; for a run with --init
 
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from cref_jax import config, terrain
 from cref_jax.config import ConfigError
-from cref_jax.shapes import KINDS, START, Range, columns
+from cref_jax.shapes import KINDS, Range, columns
 from cref_jax.terrain import Terrain
 
 MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: within START
@@ -73,6 +73,7 @@ def build(c: config.Terrain) -> Atlas:
         return _own_map(path)
     _check_lane(c)
     numbers = _numbers(c.name)
+    numbers = {kind: n._replace(shape=n.practice) for kind, n in numbers.items()}
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
     atlas = _atlas(c, numbers, sizes, [c.seed] * c.levels)
     return atlas.replace(turns=_turns(c.name, atlas.kinds))
@@ -125,6 +126,7 @@ class _Numbers(NamedTuple):
     train: Range  # m, size at the lowest and the highest level
     levels: _Levels | None  # m, sizes for evaluation
     shape: Any  # the record that KINDS names
+    practice: Any  # the same for the lanes of training
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,7 @@ class _KindsFile:
     train: Range
     levels: dict
     shape: dict
+    practice: dict  # what differs from the shape on the lanes of training
 
 
 @dataclass(frozen=True)
@@ -167,8 +170,6 @@ def _atlas(
             drawn_by = [seeds[level], zlib.crc32(kind.encode()), round(1e4 * size)]
             rng = np.random.default_rng(drawn_by)
             heights[level, :, k] = KINDS[kind].heights(c, float(size), n.shape, rng)
-            if heights[level, : columns(START, c), k].any():
-                raise ConfigError(f"'{kind}' must leave {START} m of level ground at its start")
     grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
     origin = (0.0, -0.5 * across * c.cell)
     return Atlas(
@@ -254,7 +255,7 @@ def _kinds(table: dict[str, Any], where: str) -> dict[str, _Numbers]:
     """Return the numbers in the tables of a terrain file that defines kinds."""
     if "mix" in table:
         raise ConfigError(f"{where} is a mix itself; a mix names terrains that define kinds")
-    file = _record(_KindsFile, {"levels": {}, "shape": {}} | table, where)
+    file = _record(_KindsFile, {"levels": {}, "shape": {}, "practice": {}} | table, where)
     if not 0.0 <= file.train[0] <= file.train[1]:
         raise ConfigError(f"{where}: train must be [lowest, highest], not {list(file.train)}")
     if not file.kinds:
@@ -264,18 +265,24 @@ def _kinds(table: dict[str, Any], where: str) -> dict[str, _Numbers]:
     for kind in file.kinds:
         if kind not in KINDS:
             raise _unknown("kind", kind, KINDS)
-        shape = _record(KINDS[kind].shape, file.shape, f"{where}: shape")
-        _check_shape(file.shape, f"{where}: shape")
-        numbers[kind] = _Numbers(file.train, levels, shape)
+        shape = _shape(kind, file.shape, f"{where}: shape")
+        practice = _shape(kind, file.shape | file.practice, f"{where}: practice")
+        numbers[kind] = _Numbers(file.train, levels, shape, practice)
     return numbers
 
 
-def _check_shape(shape: dict[str, Any], where: str) -> None:
-    """Refuse numbers of a shape that no lane can be made of."""
-    for key, value in shape.items():
+def _shape(kind: str, table: dict[str, Any], where: str) -> Any:
+    """Return the record that a kind's shape is drawn from.
+
+    Raises:
+        ConfigError: numbers that no lane can be made of.
+    """
+    shape = _record(KINDS[kind].shape, table, where)
+    for key, value in table.items():
         numbers = value if isinstance(value, list) else [value]
         if not numbers or numbers[0] <= 0 or numbers != sorted(numbers):
             raise ConfigError(f"{where}: {key} must be above zero and rising, not {value}")
+    return shape
 
 
 def _record(cls: type, table: dict[str, Any], where: str) -> Any:

@@ -58,7 +58,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     robots = shared(world, key_robots)
     seen = robots.observation
     joints = len(world.physics.robot.joint_names)
-    params = rollout.initial_params(c.network, joints, robots, key_params)
+    params = rollout.initial_params(c, joints, robots, key_params)
     sizes = seen.proprioception.shape[-1], seen.privileged.shape[-1]
     train = ppo.initial_state(params, *sizes, c.ppo)
     return RunState(jax.lax.with_sharding_constraint(train, NamedSharding(mesh, P())), robots)

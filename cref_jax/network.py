@@ -56,6 +56,7 @@ class Output(NamedTuple):
     mean: Float[Array, "T E J"]  # of the action distribution
     log_std: Float[Array, " J"]  # of the action distribution, the same in every state
     velocity: Float[Array, "T E 3"]  # m/s, estimate of the base's linear velocity, body frame
+    feature: Float[Array, "T E D"]  # y_t, Eq. 16, that the action is read off
     gate: Float[Array, "T E D"]  # beta_t, Eq. 16: near 1 where the action leans on memory
     attention: Float[Array, "T E heads N"] | None  # weights of the depth tokens, Eq. 10
 
@@ -161,7 +162,7 @@ class Actor(nn.Module):
             x = jnp.concatenate([x, jnp.where(seen, found, 0.0)], axis=-1)
         f = self.fusion(x)
         gru, y, gate = self.recurrent_fusion(carry.gru, f, begins)
-        output = Output(self.action_head(y), self.log_std, velocity, gate, attention)
+        output = Output(self.action_head(y), self.log_std, velocity, y, gate, attention)
         return Carry(*lstm, gru), output
 
 

@@ -16,11 +16,10 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
 
-from cref_jax import config, gaussian
+from cref_jax import config, gaussian, readout
+from cref_jax.readout import Readout
 
-with contextlib.redirect_stdout(
-    io.StringIO()
-):  # brax loads MJX, which reports that warp is missing
+with contextlib.redirect_stdout(io.StringIO()):  # brax loads MJX, which says that warp is missing
     from brax.training.acme import running_statistics
     from brax.training.acme.running_statistics import RunningStatisticsState
 
@@ -37,6 +36,7 @@ class Prediction(Protocol):
     mean: Float[Array, "T E J"]
     log_std: Float[Array, " J"]
     velocity: Float[Array, "T E V"]
+    feature: Float[Array, "T E D"]  # that the mean is read off; only a readout looks at it
 
 
 class Networks(NamedTuple):
@@ -53,6 +53,7 @@ class Params(NamedTuple):
 
     actor: PyTree
     critic: PyTree
+    readout: Readout | None = None  # of the last M of the critic's observations
 
 
 class Statistics(NamedTuple):
@@ -68,6 +69,7 @@ class TrainState:
     """Everything that learning carries from one iteration to the next."""
 
     params: Params
+    average: PyTree  # of the actor's parameters, over the last iterations: steadier than they are
     opt_state: optax.OptState  # holds the learning rate and the count of bad gradients, too
     statistics: Statistics
     iteration: Int[Array | jax.ShapeDtypeStruct, "*seeds"]  # or its shape alone, in eval_shape
@@ -117,6 +119,7 @@ class Losses(NamedTuple):
     surrogate: Float[Array, "*n"]
     value: Float[Array, "*n"]
     velocity: Float[Array, "*n"]  # m^2/s^2
+    readout: Float[Array, "*n"]  # in variances of what is read out
     entropy: Float[Array, "*n"]  # nats
     kl: Float[Array, "*n"]  # nats, of the behaviour policy from the present one
     clipped: Float[Array, "*n"]  # share of samples whose ratio is outside the clip range
@@ -131,6 +134,7 @@ def initial_state(params: Params, obs_size: int, critic_obs_size: int, c: config
     empty = lambda n: running_statistics.init_state(jnp.zeros(n), std_eps=floor)
     return TrainState(
         params=params,
+        average=params.actor,
         opt_state=optimiser(c).init(params),
         statistics=Statistics(obs=empty(obs_size), critic_obs=empty(critic_obs_size)),
         iteration=jnp.zeros((), jnp.int32),
@@ -158,7 +162,8 @@ def update(
 ) -> tuple[TrainState, Losses]:
     """Learn from one rollout; the losses are [epochs, minibatches].
 
-    The rollout is normalised by the statistics that it was made with. They learn of it at the end.
+    The rollout is normalised by the statistics that it was made with. They learn of it at the end,
+    and so does the average: it fades over a tenth of all iterations, over `c.average` at most.
     With an `axis` this is one of several devices, each with a rollout of its own: they agree on
     every gradient, and learn as one device would from all the rollouts.
     """
@@ -177,7 +182,10 @@ def update(
         obs=observe(state.statistics.obs, rollout.obs, rollout.valid, axis),
         critic_obs=observe(state.statistics.critic_obs, rollout.critic_obs, rollout.valid, axis),
     )
-    return state.replace(statistics=statistics, iteration=state.iteration + 1), losses
+    share = 1.0 / (1.0 + jnp.minimum(0.1 * state.iteration, c.average))
+    average = optax.incremental_update(state.params.actor, state.average, share)
+    iteration = state.iteration + 1
+    return state.replace(average=average, statistics=statistics, iteration=iteration), losses
 
 
 def judge(
@@ -271,10 +279,14 @@ def loss(
     ratio = jnp.exp(jnp.where(batch.valid, new - old, 0.0))
     divergence = gaussian.kl(batch.mean, batch.log_std, policy.mean, policy.log_std)
     error = jnp.sum(jnp.square(policy.velocity - batch.velocity), axis=-1)
+    misread = jnp.zeros_like(value)
+    if params.readout is not None:
+        misread = readout.error(params.readout, policy.feature, batch.critic_obs)
     parts = Losses(
         surrogate=mean(surrogate(ratio, batch.advantage, c.clip)),
         value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),
         velocity=mean(error),
+        readout=mean(misread),
         entropy=gaussian.entropy(policy.log_std),
         kl=mean(divergence),
         clipped=mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype)),
@@ -283,6 +295,7 @@ def loss(
         parts.surrogate
         + c.value_weight * parts.value
         + c.estimator_weight * parts.velocity
+        + c.readout_weight * parts.readout
         - c.entropy_weight * parts.entropy
     )
     return total, jax.lax.stop_gradient(parts)

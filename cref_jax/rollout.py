@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, network, ppo
+from cref_jax import config, depth, env, episode, network, ppo, readout
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
@@ -102,19 +102,24 @@ def networks(c: config.Network, num_actions: int) -> Networks:
 
 
 def initial_params(
-    c: config.Network, num_actions: int, robots: Robots, key: PRNGKeyArray
+    c: config.Config, num_actions: int, robots: Robots, key: PRNGKeyArray
 ) -> ppo.Params:
     """Return fresh parameters for observations of the robots' shapes."""
     key_actor, key_critic = jax.random.split(key)
     one = lambda x: x[None, :1]
-    carry, nets = network.initial_carry(c, 1), networks(c, num_actions)
-    obs, begins = one(robots.observation.proprioception), one(robots.begins)
+    seen, begins = robots.observation, one(robots.begins)
+    carry, nets = network.initial_carry(c.network, 1), networks(c.network, num_actions)
     sight = robots.feed and network.Sight(
         one(robots.feed.frame), jnp.zeros_like(begins, jnp.int32), begins
     )
+    (_, said), actor = nets.actor.init_with_output(
+        key_actor, carry, one(seen.proprioception), begins, sight
+    )
+    shape = said.feature.shape[-1], c.scan.x[2] * c.scan.y[2]
     return ppo.Params(
-        actor=nets.actor.init(key_actor, carry, obs, begins, sight),
-        critic=nets.critic.init(key_critic, one(robots.observation.privileged)),
+        actor=actor,
+        critic=nets.critic.init(key_critic, one(seen.privileged)),
+        readout=readout.untaught(*shape) if c.ppo.readout_weight else None,
     )
 
 

@@ -203,7 +203,12 @@ def load_policy(run: Path, world: World) -> Policy:
     with checkpoints(run) as steps:
         newest = steps.latest()
         train = steps.restore_part("train", like, newest)
-        return Policy(c, train, newest or 0, run)
+        return Policy(c, kept(train), newest or 0, run)
+
+
+def kept(train: ppo.TrainState) -> ppo.TrainState:
+    """Return the state whose actor is the average: the policy that is evaluated and exported."""
+    return train.replace(params=train.params._replace(actor=train.average))
 
 
 def _experiment(name: str) -> Path:

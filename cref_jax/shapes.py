@@ -63,9 +63,9 @@ class Flight:
 class Gap:
     """Numbers of the trenches in a lane."""
 
-    count: int
+    count: int  # at most: as many as the lane has room for
     depth: float  # m
-    landing: Range  # m, before each trench
+    landing: Range  # m, before each trench; START at least before the first
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Platform:
 
     count: tuple[int, int]  # from, to: as many as the lane has room for
     length: Range  # m, of a box
-    landing: Range  # m, before each box
+    landing: Range  # m, before each box; START at least before the first
 
 
 def flat(c: config.Terrain, size: float, shape: Flat, rng: np.random.Generator) -> Heights:
@@ -129,7 +129,7 @@ def ascent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Generat
     steps = rng.integers(shape.steps[0], shape.steps[1] + 1)
     start = START + rng.uniform(0.0, 0.5)  # assumed: not always the same
     flight = [(start, 0.0), *((shape.tread, size * k) for k in range(1, steps))]
-    _check_length(c, _length(flight) + END)
+    _check_length(c, _length(flight, c) + END)
     return _across(c, flight, last=size * steps)
 
 
@@ -141,9 +141,12 @@ def descent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Genera
 def gap(c: config.Terrain, size: float, shape: Gap, rng: np.random.Generator) -> Heights:
     """Return level ground cut by equal trenches, `size` metres wide."""
     sections = []
-    for _ in range(shape.count):
-        sections += [(rng.uniform(*shape.landing), 0.0), (size, -shape.depth)]
-    _check_length(c, _length(sections) + END)
+    for k in range(shape.count):
+        trench = [(_landing(shape.landing, k, rng), 0.0), (size, -shape.depth)]
+        if k > 0 and _length(sections + trench, c) > c.lane_length - END:
+            break
+        sections += trench
+    _check_length(c, _length(sections, c) + END)
     return _across(c, sections)
 
 
@@ -151,11 +154,12 @@ def platform(c: config.Terrain, size: float, shape: Platform, rng: np.random.Gen
     """Return level ground with boxes on it, `size` metres high, to step up and down."""
     sections = []
     for k in range(shape.count[1]):
-        box = [(rng.uniform(*shape.landing), 0.0), (rng.uniform(*shape.length), size)]
-        if k >= shape.count[0] and _length(sections + box) > c.lane_length - END:
+        landing = _landing(shape.landing, k, rng)
+        box = [(landing, 0.0), (rng.uniform(*shape.length), size)]
+        if k >= shape.count[0] and _length(sections + box, c) > c.lane_length - END:
             break
         sections += box
-    _check_length(c, _length(sections) + END)
+    _check_length(c, _length(sections, c) + END)
     return _across(c, sections)
 
 
@@ -190,6 +194,11 @@ def _centres(c: config.Terrain) -> tuple[np.ndarray, np.ndarray]:
     return middles(c.lane_length), middles(c.lane_width)
 
 
+def _landing(span: Range, number: int, rng: np.random.Generator) -> float:
+    """Return the length of level ground before an obstacle of this number, m."""
+    return max(rng.uniform(*span), 0.0 if number else START)
+
+
 def _across(c: config.Terrain, sections: list[tuple[float, float]], last: float = 0.0) -> Heights:
     """Return the lane made of (length, height) sections from the start on, then level at `last`."""
     profile = np.concatenate([np.full(columns(length, c), z) for length, z in sections])
@@ -199,9 +208,9 @@ def _across(c: config.Terrain, sections: list[tuple[float, float]], last: float 
     return np.repeat(profile[:, None], columns(c.lane_width, c), axis=1).astype(np.float32)
 
 
-def _length(sections: list[tuple[float, float]]) -> float:
-    """Return the length of (length, height) sections, m."""
-    return sum(length for length, _ in sections)
+def _length(sections: list[tuple[float, float]], c: config.Terrain) -> float:
+    """Return the length of (length, height) sections in whole columns, m."""
+    return sum(columns(length, c) for length, _ in sections) * c.cell
 
 
 def _check_length(c: config.Terrain, needed: float) -> None:

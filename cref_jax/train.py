@@ -290,7 +290,7 @@ def _summary(run: Path, c: Config, state: learn.RunState, options: Options) -> N
     """Say what was learned and what to type next."""
     if options.evaluate:
         physics = runs.physics_of(c, options.engine)
-        one = jax.device_put(state.train, jax.devices()[0])
+        one = jax.device_put(runs.kept(state.train), jax.devices()[0])
         result = evaluation.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')

@@ -56,11 +56,11 @@ def test_mixed_holds_every_kind_once(mixed):
 
 
 def test_robots_are_put_on_the_kinds_in_turn_as_often_as_their_shares_ask_for(mixed):
-    # 7 kinds, 4 of them three times: 7 + 4 + 4 turns
-    assert mixed.turns == (0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 3, 4, 5, 6)
+    # 7 kinds, 4 of them twice, 2 a third and one a fourth time: 7 + 4 + 2 + 1 turns
+    assert mixed.turns == (0, 1, 2, 3, 4, 5, 6, 3, 4, 5, 6, 5, 6, 5)
     names = [mixed.kinds[k] for k in mixed.kind_of(np.arange(7, 17))]
-    stairs = ["stairs_up", "stairs_down"]
-    assert names == [*stairs, "gap", "platform"] * 2 + ["flat", "rough"]
+    again = ["stairs_up", "stairs_down", "gap", "platform", "gap", "platform", "gap"]
+    assert names == [*again, "flat", "rough", "slope"]
     assert lanes.build(config.Terrain(name="stairs")).turns == (0, 1)
 
 
@@ -124,6 +124,21 @@ def test_a_gap_lane_has_three_trenches_a_metre_deep_and_no_narrower_than_asked(w
     assert len(trenches) == 3 and len(landings) == 4
     assert all(width - 1e-9 <= length < width + CELL for length in trenches)
     assert all(1.5 <= length <= 2.5 + CELL for length in landings[:-1])
+
+
+@pytest.mark.parametrize(("kind", "size"), [("gap", 0.0), ("gap", 0.75), ("platform", 0.40)])
+def test_obstacles_stand_closer_on_the_lanes_of_training(kind, size):
+    c = config.Terrain(name=kind)
+    atlas = lanes.build(c)
+    level = int(np.flatnonzero(np.isclose(atlas.sizes[:, 0], size))[0])
+    between = lambda heights: [length for height, length in runs(heights)[1:-1] if height == 0.0]
+    ahead, apart = profile(atlas, level), single(kind, size, seed=c.seed)
+    if size == 0.0:
+        assert not ahead.any()
+    else:
+        assert len(between(ahead)) > len(between(apart))
+        assert all(0.7 <= length <= 1.5 + CELL for length in between(ahead))
+    assert runs(ahead)[0][1] >= 1.5 and runs(ahead)[-1][1] >= 1.0
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -302,7 +317,8 @@ GAP = 'kinds = ["gap"]\ntrain = [0.1, 0.2]\n[shape]\ncount = 1\ndepth = 1.0\nlan
         ("count = 1", 'count = "1"', "must be int, not '1'"),
         ("depth = 1.0", "depth = 0.0", "shape: depth must be above zero and rising, not 0.0"),
         ("[2.0, 2.0]", "[2.5, 1.5]", "landing must be above zero and rising, not [2.5, 1.5]"),
-        ("[2.0, 2.0]", "[1.0, 1.0]", "'gap' must leave 1.5 m of level ground at its start"),
+        ("[shape]", "[practice]\nlanding = [2.0, 1.0]\n[shape]", "practice: landing must be above"),
+        ("[shape]", "[practice]\nland = 1\n[shape]", "practice: land'; did you mean 'landing'?"),
         ("[2.0, 2.0]", "[20.0, 20.0]", "lane_length is 12 m, but 21.10 m are needed"),
         ("[shape]", "[levels]\neasy = 0.3\n[shape]", "mine.toml: levels: 'hard' is missing"),
         ("[shape]", "[[shape", "mine.toml"),

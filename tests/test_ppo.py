@@ -10,11 +10,12 @@ import pytest
 from brax.training.agents.ppo.losses import compute_gae
 from jax.test_util import check_grads
 
-from cref_jax import config, gaussian, network, ppo
+from cref_jax import config, gaussian, network, ppo, readout
 
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
 SMALL = config.Network(variant="blind", token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
+FEATURES = 6  # of a blind policy: as many as of a token
 KEY = jax.random.key(0)
 NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
 
@@ -215,12 +216,44 @@ def test_the_loss_worked_by_hand():
         "surrogate": -2.199318,
         "value": 0.81,
         "velocity": 5.0,
+        "readout": 0.0,
         "entropy": 1.418939,
         "kl": 0.005,
         "clipped": 0.0,
     }
     for name, value in expected.items():
         np.testing.assert_allclose(getattr(parts, name), value, rtol=1e-5, err_msg=name)
+
+
+def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():
+    batch = judge(some_rollout())
+    params = initial_params()
+    silent = readout.untaught(FEATURES, 2)
+    says = silent._replace(bias=jnp.array([1.0, -2.0]))
+    c = dataclasses.replace(C, readout_weight=0.5)
+    without, parts = ppo.loss(params, batch, c, NETWORKS)
+    assert parts.readout == 0.0
+    total, parts = ppo.loss(params._replace(readout=says), batch, c, NETWORKS)
+    wanted = np.mean((batch.critic_obs[..., -2:] - np.array([1.0, -2.0])) ** 2)
+    np.testing.assert_allclose(parts.readout, wanted, rtol=1e-5)
+    np.testing.assert_allclose(total - without, 0.5 * wanted, rtol=1e-4)
+
+
+def test_the_readout_teaches_the_actors_features():
+    batch = judge(some_rollout())
+    kernel = jax.random.normal(KEY, (FEATURES, 2))
+    params = initial_params()._replace(readout=readout.Readout(kernel, jnp.zeros(2)))
+
+    def slope(weight):
+        c = dataclasses.replace(C, readout_weight=weight)
+        return jax.grad(lambda p: ppo.loss(p, batch, c, NETWORKS)[0])(params).actor["params"]
+
+    changes = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), slope(1.0), slope(0.0))
+    largest = {name: max(jax.tree.leaves(part)) for name, part in changes.items()}
+    for name in ("recurrent_fusion", "fusion", "proprioceptive_tokenizer"):
+        assert largest[name] > 1e-4, name
+    for name in ("action_head", "log_std", "velocity_estimator"):
+        assert largest[name] < 1e-6, name
 
 
 def test_the_gradient_of_the_loss_agrees_with_finite_differences():
@@ -403,6 +436,15 @@ def test_the_critic_alone_learns_first():
     assert same(actors[0], actors[1]) and same(actors[1], actors[2])
     assert not same(actors[2], actors[3])
     assert not same(critics[0], critics[1]) and not same(critics[1], critics[2])
+
+
+@pytest.mark.parametrize(("iteration", "share"), [(0, 1.0), (30, 1 / 4), (10**6, 1 / 201)])
+def test_the_average_fades_over_a_tenth_of_all_iterations_up_to_a_limit(iteration, share):
+    before = initial_state().replace(iteration=jnp.array(iteration))
+    before = before.replace(average=jax.tree.map(jnp.zeros_like, before.average))
+    after, _ = update(before, some_rollout(), KEY)
+    expected = jax.tree.map(lambda p: share * p, after.params.actor)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), after.average, expected)
 
 
 def test_statistics_are_those_of_all_valid_samples():

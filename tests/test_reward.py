@@ -307,15 +307,15 @@ def test_the_sum_is_scaled_by_the_period_and_cut_at_zero(x2, times_dt, clip_at_z
 
 
 def test_a_touchdown_counts_for_its_own_time(x2):
-    # on a foothold after 0.3 s in the air: 7.4 * 0.02 + (2 - 2.5 * (0.5 - 0.3)) * 0.1 = 0.298
+    # on a foothold after 0.3 s in the air: 7.4 * 0.02 + (2 - 2.5 * (0.5 - 0.3)) * 0.25 = 0.523
     landing = perfect(x2)._replace(
         first_contact=jnp.array([True, False]),
         air_time=jnp.array([0.3, PERIOD]),
         foothold_distance=jnp.array([0.0, jnp.inf]),
     )
     found, parts = reward.total(landing, C, x2)
-    assert float(found) == pytest.approx(0.298)
-    assert float(parts["foothold_placement"]) == pytest.approx(2.0 * 0.1 / 0.02)
+    assert float(found) == pytest.approx(0.523)
+    assert float(parts["foothold_placement"]) == pytest.approx(2.0 * 0.25 / 0.02)
     raw, _ = reward.total(landing, dataclasses.replace(C, times_dt=False), x2)
     assert float(raw) == pytest.approx(7.4 + 2.0 - 0.5)
 
