@@ -147,7 +147,8 @@ class Episode:
 
     length: float = 20.0  # s; assumed: 20 s in training, 40 s in evaluation
     max_tilt: float = 1.0  # rad; assumed
-    min_height: float = 0.28  # m, pelvis above the supporting ankles, 0.35 above the sole; assumed
+    min_height: float = 0.15  # m, pelvis above the supporting ankles, 0.22 above the sole; assumed:
+    # a foot comes down on a box of 40 cm when the pelvis is still 0.3 m above the box
     below_edge: float = 0.5  # m, a foot below the last support: into a gap; assumed: two 23 cm
     # treads at once are still a step, and gap floors lie 1 m down
     stall_time: float = 5.0  # s between two looks whether a robot stands in its lane, 0: none;

@@ -206,8 +206,8 @@ def test_too_much_tilt_ends_it(causes, robots):
 def test_a_pelvis_too_near_to_the_support_ends_it(causes, robots):
     state = one(robots)
     z = float(state.body.qpos[2])
-    assert causes(state.replace(support_z=jnp.float32(z - 0.27))) == {"low"}
-    assert causes(state.replace(support_z=jnp.float32(z - 0.29))) == set()
+    assert causes(state.replace(support_z=jnp.float32(z - 0.14))) == {"low"}
+    assert causes(state.replace(support_z=jnp.float32(z - 0.16))) == set()
 
 
 def test_a_body_in_the_terrain_ends_it(world, causes, robots):
