@@ -1,9 +1,11 @@
 """An exported policy on the robot's stand-in: `python -m cref_jax.sim2sim --policy policy/`."""
 
+import dataclasses
 import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from cref_jax import deploy  # before numpy, whose number of threads it sets
 
@@ -15,12 +17,15 @@ from cref_jax import film  # before mujoco, whose OpenGL it chooses
 
 import numpy as np
 import tyro
+from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, evaluation, exported, processes, runs, scene, stand_in
+from cref_jax import cli, evaluation, exported, processes, runs, scene, stand_in, transfer
 from cref_jax.config import Config, ConfigError
 from cref_jax.disturbance import Disturbance
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
+from cref_jax.physics import Physics
+from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.world import World
 
@@ -46,6 +51,8 @@ class Options:
     """s from a frame's exposure until the policy has it"""
     compare: bool = False
     """evaluate the same trials in the training simulation, too"""
+    table: bool = False
+    """flat ground and each cell of Table II, with --compare; so many trials each"""
     out: Path | None = None
     """file for the results, .json"""
     film: Path | None = None
@@ -63,31 +70,59 @@ def main(arguments: list[str] | None = None) -> None:
             raise ConfigError(f"--trials must be at least 1, not {options.trials}")
         if options.film and options.film.suffix != ".mp4":
             raise ConfigError(f"--film must end in .mp4: {options.film}")
+        if options.film and options.table:
+            raise ConfigError("--film goes with one --kind, not with --table")
         path = options.policy or exported.bundled()
         policy = exported.read(path)
         physics = runs.world_of(policy.config, "mujoco").physics
-        world = evaluation.crossing_world(policy.config, physics, options.kind, options.size)
-        trials = walked(world, path, options)
-        result = crossing(trials, options)
-        print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
-        said = Counter(
-            flag.name for trial in trials for flag in deploy.Status if flag & trial.status
-        )
-        if said:
-            print("the policy said: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
-        record = {"stand_in": result._asdict(), "status": said}
-        if options.compare:
-            theirs = evaluation.cross(
-                policy.config, physics, policy.train, options.kind, options.size, options.trials,
-                options.seed,
-            )  # fmt: skip
-            print(f"training simulation, JAX:   {theirs.line()}")
-            record["training"] = theirs._asdict()
-        if options.film:
-            _film(options.film, world, trials[0])
-            print(f"wrote {options.film}")
+        record = (_table if options.table else _one)(policy, path, physics, options)
         if options.out:
             options.out.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def _one(policy: Policy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
+    """Say what becomes of the trials on lanes of one kind, and return it."""
+    world = evaluation.crossing_world(policy.config, physics, options.kind, options.size)
+    trials = walked(world, path, options)
+    result = crossing(trials, options)
+    print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
+    said = Counter(flag.name for trial in trials for flag in deploy.Status if flag & trial.status)
+    if said:
+        print("the policy said: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
+    record = {"stand_in": result._asdict(), "status": said}
+    if options.compare:
+        theirs = in_training(policy, physics, options)
+        print(f"training simulation, JAX:   {theirs.line()}")
+        record["training"] = theirs._asdict()
+    if options.film:
+        _film(options.film, world, trials[0])
+        print(f"wrote {options.film}")
+    return record
+
+
+def _table(policy: Policy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
+    """Say what becomes of the trials on flat ground and in each cell, and return it."""
+    cells = []
+    for name, lanes in track(transfer.lanes().items(), "cells"):
+        ours, theirs = [], []
+        for kind, size in lanes:
+            count = max(1, options.trials // len(lanes))
+            on = dataclasses.replace(options, kind=kind, size=size, trials=count)
+            world = evaluation.crossing_world(policy.config, physics, kind, size)
+            ours.append(crossing(walked(world, path, on), on))
+            theirs.append(in_training(policy, physics, on))
+        cells.append(transfer.Cell(name, tuple(theirs), tuple(ours)))
+    Console().print(transfer.text(cells))
+    asdict = lambda crossings: [c._asdict() for c in crossings]
+    return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
+
+
+def in_training(policy: Policy, physics: Physics, options: Options) -> Crossing:
+    """Return what becomes of the same trials in the training simulation."""
+    return evaluation.cross(
+        policy.config, physics, policy.train, options.kind, options.size, options.trials,
+        options.seed,
+    )  # fmt: skip
 
 
 def walked(world: World, path: Path, options: Options) -> list[Trial]:

@@ -24,7 +24,7 @@ LAYERS = [
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"runs", "peers", "stand_in", "table", "run_page", "ood"},
-    {"exported", "ood_verdict"},
+    {"exported", "ood_verdict", "transfer"},
     {"watch", "ood_suite"},
     {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
 ]
