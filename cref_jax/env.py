@@ -50,7 +50,7 @@ class Outcome(NamedTuple):
 def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     """Return what the robot and the critic see in this state."""
     c, robot = world.config, world.physics.robot
-    clean = observation.motion(state.body.qpos, state.body.qvel)
+    clean = observation.motion(state.body.qpos, state.body.qvel, state.action.size)
     sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
     if c.randomisation.enabled:
         sensed = observation.with_noise(sensed, c.randomisation, key)
@@ -149,7 +149,7 @@ def _snapshot(
     foot = links.position[feet]
     touching = reward.is_touching(force, c.reward)
     single = touching[0] ^ touching[1]
-    now = observation.motion(body.qpos, body.qvel)
+    now = observation.motion(body.qpos, body.qvel, action.size)
     across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
     return reward.Snapshot(
         velocity=now.velocity,

@@ -25,7 +25,7 @@ from cref_jax.config import Config, ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
 
-BUNDLED = "gap"  # the policy that comes with the package
+BUNDLED = "mixed"  # the policy that comes with the package
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
 STALE = 0.1  # s, two frames of the camera
 MOST_INVALID = 0.5  # of a frame's pixels; assumed: beyond, the last frame tells more
@@ -324,9 +324,9 @@ def _state(c: config.Network) -> dict[str, Any]:
 def _guards(driven: robot.Robot) -> dict[str, Any]:
     """Return the limits of the runtime; those on targets only take what the motors cannot do.
 
-    A target further than effort / kp from the pose asks for no more torque.
+    A target that is further from the pose than this asks for no more torque, at whatever speed.
     """
-    reach = [float(x) for x in driven.effort / driven.kp]
+    reach = [float(x) for x in (driven.effort + driven.kd * driven.velocity_limit) / driven.kp]
     return {
         "hold_steps": HOLD_STEPS,
         "stale_s": STALE,
@@ -341,7 +341,8 @@ def _provenance(policy: Policy) -> dict[str, Any]:
     c, origin = policy.config, policy.run / "origin.jsonl"
     lines = origin.read_text().splitlines() if origin.is_file() else []
     start = json.loads(lines[-1]) if lines else {"command": []}
-    start["command"] = [Path(word).name for word in start["command"][:1]] + start["command"][1:]
+    bare = lambda word: Path(word).name if Path(word).is_absolute() else word  # no one's folders
+    start["command"] = [bare(word) for word in start["command"]]
     return {
         "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "run": policy.run.name,

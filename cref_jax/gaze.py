@@ -85,7 +85,7 @@ def ahead(world: World) -> Float[np.ndarray, " rows"]:
     """
     robot, camera = world.physics.robot, world.config.camera
     base = [0.0, 0.0, robot.standing_height, 1.0, 0.0, 0.0, 0.0]
-    qpos = jnp.concatenate([jnp.array(base), jnp.asarray(robot.nominal_pose)])
+    qpos = jnp.concatenate([jnp.array(base), jnp.asarray(robot.rest_pose)])
     links = kinematics.links(world.physics.tree, qpos, jnp.zeros(qpos.size - 1))
     position, axes = depth.pose(links, robot.camera, camera, 0.0, jnp.zeros(3))
     count, _ = grid(world.config)

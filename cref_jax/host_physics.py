@@ -63,7 +63,7 @@ class HostEngine:
         qpos: Float[Array, " Q"],
         qvel: Float[Array, " V"],
         warmstart: Float[Array, " V"],
-        target: Float[Array, " J"],
+        target: Float[Array, " M"],
         plane_position: Float[Array, "P 3"],
         plane_rotation: Float[Array, "P 4"],
         dynamics: Dynamics,
@@ -168,6 +168,7 @@ class _Simulations:
         self._friction[:, :, :2] = np.asarray(dynamics.friction)[:, None, None]
         self._mass[:, self._trunk] = self._nominal_mass + np.asarray(dynamics.payload)
         self._com[:, self._trunk] = self._nominal_com + np.asarray(dynamics.com_shift)
-        self._gain[:, :, 0] = dynamics.kp
-        self._bias[:, :, 1] = -np.asarray(dynamics.kp)
-        self._bias[:, :, 2] = -np.asarray(dynamics.kd)
+        driven = np.shape(dynamics.kp)[1]
+        self._gain[:, :driven, 0] = dynamics.kp
+        self._bias[:, :driven, 1] = -np.asarray(dynamics.kp)
+        self._bias[:, :driven, 2] = -np.asarray(dynamics.kd)

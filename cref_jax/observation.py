@@ -47,15 +47,18 @@ def slices(num_joints: int) -> dict[str, slice]:
     }
 
 
-def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"]) -> Motion:
-    """Return the motion in the body frame; MuJoCo's free joint has its velocity in the world's."""
+def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"], joints: int) -> Motion:
+    """Return the motion in the body frame; MuJoCo's free joint has its velocity in the world's.
+
+    `joints` is J, how many the policy drives; those that are held come after them.
+    """
     rotation = qpos[3:7]
     return Motion(
         velocity=geometry.rotate_inverse(rotation, qvel[:3]),
         angular_velocity=qvel[3:6],
         gravity=geometry.rotate_inverse(rotation, jnp.asarray(GRAVITY)),
-        joint_position=qpos[7:],
-        joint_velocity=qvel[6:],
+        joint_position=qpos[7 : 7 + joints],
+        joint_velocity=qvel[6 : 6 + joints],
     )
 
 

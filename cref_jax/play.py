@@ -33,6 +33,7 @@ from cref_jax import (
     network,
     panel,
     ppo,
+    robot,
     rollout,
     runs,
     scene,
@@ -145,7 +146,7 @@ def play(options: Options) -> None:
     world = _world(options, c)
     train = exported.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
-    model = scene.build(c.robot.actuated, c.physics, world.lanes.tile(0, 0))
+    model = scene.build(robot.moving(c.robot), c.physics, world.lanes.tile(0, 0))
     with scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
         recording = record(world, train, options)
         if options.stills:

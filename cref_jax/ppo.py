@@ -354,14 +354,15 @@ def _descend(
 ) -> tuple[TrainState, Losses]:
     """Take one step of the optimiser at the rate that the KL asks for.
 
-    In the first `critic_first` iterations the actor stays as it is, and so does the rate.
+    In the first `critic_first` iterations actor and rate stay; the actor begins at the lowest rate.
     """
     before = optax.tree.get(state.opt_state, "learning_rate")
     rate = adapt(before, losses.kl, c)
     if c.critic_first:
-        acts = state.iteration >= c.critic_first
-        still = jax.tree.map(lambda g: jnp.where(acts, g, 0.0), grads.actor)
-        grads, rate = grads._replace(actor=still), jnp.where(acts, rate, before)
+        since = state.iteration - c.critic_first
+        still = jax.tree.map(lambda g: jnp.where(since < 0, 0.0, g), grads.actor)
+        rate = jnp.where(since > 0, rate, jnp.where(since < 0, before, c.learning_rate_range[0]))
+        grads = grads._replace(actor=still)
     opt_state = optax.tree.set(state.opt_state, learning_rate=rate)
     changes, opt_state = optimiser(c).update(grads, opt_state, state.params)
     state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)

@@ -6,7 +6,7 @@ nominal pose and the roles of joints and links stand here.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import mujoco
 import numpy as np
@@ -16,6 +16,7 @@ from cref_jax import config
 
 XML = Path(__file__).parent / "assets" / "x2_ultra.xml"
 Actuated = Literal["legs", "legs+waist", "all"]
+MOVING: dict[str, Actuated] = {"none": "legs", "waist": "legs+waist", "all": "all"}  # at least
 
 NOMINAL_POSE = {  # rad, both sides; a joint not named here is at 0. assumed: flat feet, and the
     "hip_pitch": -0.42,  # pelvis at the 0.55 m above the ankles that Table I asks for
@@ -63,10 +64,14 @@ class Mount(NamedTuple):
 
 @dataclass(frozen=True)
 class Robot:
-    """The robot as the policy drives it; J actuated joints, in the model's order, SI units."""
+    """The robot as the policy drives it; J actuated joints, in the model's order, SI units.
+
+    The M joints that move are these and, after them, those that are held.
+    """
 
     joint_names: tuple[str, ...]
     nominal_pose: Float[np.ndarray, " J"]  # rad, q0
+    rest_pose: Float[np.ndarray, " M"]  # rad, q0 of all joints that move
     kp: Float[np.ndarray, " J"]  # N m/rad
     kd: Float[np.ndarray, " J"]  # N m s/rad
     effort: Float[np.ndarray, " J"]  # N m
@@ -88,27 +93,30 @@ class Robot:
 
 
 def load(c: config.Robot) -> Robot:
-    """Return the robot with the joints of `c.actuated`, read off the model that they leave."""
-    model = spec(c.actuated, config.Physics(), contact_planes=0, visual=True).compile()
+    """Return the robot with the joints of `c.actuated`, read off the model that moves."""
+    model = spec(moving(c), config.Physics(), contact_planes=0, visual=True).compile()
     joints = range(1, model.njnt)  # joint 0 is the pelvis's freejoint
-    names = tuple(model.joint(j).name for j in joints)
-    kp, effort = model.actuator_gainprm[:, 0], model.actuator_forcerange[:, 1]
-    q0 = np.array([nominal_angle(name) for name in names])
+    rest = np.array([nominal_angle(model.joint(j).name) for j in joints])
+    names = tuple(n for j in joints if _moves(n := model.joint(j).name, c.actuated))
+    first = slice(len(names))  # legs, waist, arms, head: those that are held come last
+    kp, effort = model.actuator_gainprm[first, 0], model.actuator_forcerange[first, 1]
+    q0, ranges = rest[first], model.jnt_range[1:][first]
     soles, ankles = _spheres(model), ("left_ankle_roll_link", "right_ankle_roll_link")
     return Robot(
         joint_names=names,
         nominal_pose=q0.astype(np.float32),
+        rest_pose=rest.astype(np.float32),
         kp=kp.astype(np.float32),
-        kd=-model.actuator_biasprm[:, 2].astype(np.float32),
+        kd=-model.actuator_biasprm[first, 2].astype(np.float32),
         effort=effort.astype(np.float32),
-        velocity_limit=model.jnt_user[1:, 0].astype(np.float32),
-        range_low=model.jnt_range[1:, 0].astype(np.float32),
-        range_high=model.jnt_range[1:, 1].astype(np.float32),
+        velocity_limit=model.jnt_user[1:, 0][first].astype(np.float32),
+        range_low=ranges[:, 0].astype(np.float32),
+        range_high=ranges[:, 1].astype(np.float32),
         action_scale=(c.action_scale * effort / kp).astype(np.float32),
         hip_xz=np.array(["hip_roll" in name or "hip_yaw" in name for name in names]),
         ankle_x=np.array(["ankle_roll" in name for name in names]),
         mass=float(model.body_mass.sum()),
-        standing_height=_standing_height(model, q0),
+        standing_height=_standing_height(model, rest),
         pelvis=model.body("pelvis").id,
         trunk=int(model.geom("torso_link_left").bodyid[0]),
         ankles=(model.body(ankles[0]).id, model.body(ankles[1]).id),
@@ -119,10 +127,15 @@ def load(c: config.Robot) -> Robot:
     )
 
 
+def moving(c: config.Robot) -> Actuated:
+    """Return which joints move: those that the policy drives, and those that are held."""
+    return max(c.actuated, MOVING[c.held], key=get_args(Actuated).index)
+
+
 def spec(
-    actuated: Actuated, physics: config.Physics, contact_planes: int = 1, visual: bool = False
+    moves: Actuated, physics: config.Physics, contact_planes: int = 1, visual: bool = False
 ) -> mujoco.MjSpec:
-    """Return the model in which only the `actuated` joints move.
+    """Return the model in which only the joints of `moves` do.
 
     The others are welded at the nominal pose, and links that no joint moves any more are fused
     with their parent. Each contact sphere gets `contact_planes` mocap bodies, each with a plane
@@ -132,7 +145,7 @@ def spec(
     """
     s = mujoco.MjSpec.from_file(str(XML))
     for joint in s.joints[1:]:
-        if not _moves(joint.name, actuated):
+        if not _moves(joint.name, moves):
             _weld(s, joint)
     s.compiler.fusestatic = True
     s.option.timestep = physics.timestep
@@ -161,12 +174,12 @@ def nominal_angle(joint: str) -> float:
     return -angle if mirrored and angle else angle
 
 
-def _moves(joint: str, actuated: Actuated) -> bool:
-    """Return whether the joint of this name is actuated."""
+def _moves(joint: str, those: Actuated) -> bool:
+    """Return whether the joint of this name is one of those."""
     parts = joint.split("_")
-    if actuated == "all":
+    if those == "all":
         return True
-    return parts[1] in LEG_JOINTS or (actuated == "legs+waist" and parts[0] == "waist")
+    return parts[1] in LEG_JOINTS or (those == "legs+waist" and parts[0] == "waist")
 
 
 def _weld(s: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
@@ -199,7 +212,7 @@ def _add_plane(s: mujoco.MjSpec, sphere: str, name: str) -> None:
     )
 
 
-def _standing_height(model: mujoco.MjModel, q0: Float[np.ndarray, " J"]) -> float:
+def _standing_height(model: mujoco.MjModel, q0: Float[np.ndarray, " M"]) -> float:
     """Return the height of the pelvis over the lowest point of the soles at q0, m."""
     state = mujoco.MjData(model)
     state.qpos[:7], state.qpos[7:] = (0, 0, 0, 1, 0, 0, 0), q0

@@ -102,8 +102,10 @@ def _one(policy: Policy, path: Path, physics: Physics, options: Options) -> dict
 
 def _table(policy: Policy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
     """Say what becomes of the trials on flat ground and in each cell, and return it."""
-    cells = []
-    for name, lanes in track(transfer.lanes().items(), "cells"):
+    cells: list[transfer.Cell] = []
+    asked = transfer.lanes()
+    for name, lanes in asked.items():
+        print(f"cell {len(cells) + 1} of {len(asked)}, {name}", flush=True)
         ours, theirs = [], []
         for kind, size in lanes:
             count = max(1, options.trials // len(lanes))
@@ -112,6 +114,7 @@ def _table(policy: Policy, path: Path, physics: Physics, options: Options) -> di
             ours.append(crossing(walked(world, path, on), on))
             theirs.append(in_training(policy, physics, on))
         cells.append(transfer.Cell(name, tuple(theirs), tuple(ours)))
+        print(cells[-1].line(), flush=True)
     Console().print(transfer.text(cells))
     asdict = lambda crossings: [c._asdict() for c in crossings]
     return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
@@ -160,7 +163,8 @@ def starts(world: World, seed: int, count: int) -> list[Start]:
     """Return poses and commands of the trials of this seed, as data."""
     state = evaluation.starts(world, seed, count).env
     qpos, speeds = np.asarray(state.body.qpos), np.asarray(state.command[:, 0])
-    return [Start(x[:7], x[7:], float(v)) for x, v in zip(qpos, speeds, strict=True)]
+    driven = slice(7, 7 + len(world.physics.robot.joint_names))
+    return [Start(x[:7], x[driven], float(v)) for x, v in zip(qpos, speeds, strict=True)]
 
 
 def crossing(trials: list[Trial], options: Options) -> Crossing:

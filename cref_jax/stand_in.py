@@ -144,7 +144,7 @@ class StandIn:
         self.kept_clear = {model.geom(name).id for name in clear}
 
     def image(self, state: mujoco.MjData) -> Float[np.ndarray, "H W"]:
-        """Return z-depth in metres by ray-cast, NaN where a ray meets nothing."""
+        """Return z-depth in metres by ray-cast, infinity where a ray meets nothing."""
         mount, camera = self.robot.camera, self.config.camera
         link = state.xmat[mount.body].reshape(3, 3)
         fixed = np.zeros(9)
@@ -161,7 +161,7 @@ class StandIn:
             self.model, state, position, world.ravel(), groups, True, -1, found, distance,
             None, count, FAR,
         )  # fmt: skip
-        depth = np.where(distance < 0.0, np.nan, distance * self.rays[:, 2])
+        depth = np.where(distance < 0.0, np.inf, distance * self.rays[:, 2])
         return depth.reshape(camera.shape).astype(np.float32)
 
     def feet_on_ground(self, state: mujoco.MjData) -> tuple[Float[np.ndarray, "2 3"], bool]:

@@ -16,7 +16,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 FAR = 1.0  # m, distance of a contact plane that is not there
 BLOCKS = (1, 4, 16, 64)  # columns, sides of the blocks whose tops are stored; powers of two
 _TOUCHING = 1e-6  # m, no distance is taken as shorter, so that every direction has a length
-_NEIGHBOURS = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
+_REACH = 3  # columns; a foot that swings at 8 m/s is 4 cm in a wall after one substep
+_NEIGHBOURS = [
+    *((a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)),
+    *((k * a, k * b) for k in range(2, _REACH + 1) for a, b in ((-1, 0), (1, 0), (0, -1), (0, 1))),
+]
 _ABOVE = 1e-5  # m, a second contact lies further than this in front of the first one's plane
 
 
@@ -82,8 +86,10 @@ def closest_point(
 
     The distance is negative inside the ground. The 3 x 3 columns around `p` are searched, so the
     result is exact (to `_TOUCHING`) where the distance is below one cell, as for a contact sphere
-    of that radius. Further up it is the closest point of these columns. At an edge the normal
-    points from the edge to `p`; of two equally close points the one of p's own column is taken.
+    of that radius. Further up it is the closest point of these columns. Straight ahead and across
+    `_REACH` columns are searched, so the way out of a wall is found from as deep. At an edge the
+    normal points from the edge to `p`; of two equally close points the one of p's own column is
+    taken.
     """
     offsets, outside = _offsets(terrain, p)
     nearest = _nearest(offsets)
@@ -149,7 +155,7 @@ class _Offset(NamedTuple):
 
 
 def _offsets(terrain: Terrain, p: Float[Array, " 3"]) -> tuple[list[_Offset], Float[Array, ""]]:
-    """Return the ways from `p` to the 9 columns, its own first, and 1 outside, -1 inside.
+    """Return the ways from `p` to the columns around, its own first, and 1 outside, -1 inside.
 
     Outside of the ground a column's closest point is sought in the box below its height, inside
     of the ground in the air above it.
@@ -161,8 +167,9 @@ def _offsets(terrain: Terrain, p: Float[Array, " 3"]) -> tuple[list[_Offset], Fl
     u, v = jax.lax.optimization_barrier((x - i, y - j))
     east = jnp.clip(u * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
     north = jnp.clip(v * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
-    to_x = {-1: -east, 0: jnp.zeros_like(east), 1: terrain.cell - east}
-    to_y = {-1: -north, 0: jnp.zeros_like(north), 1: terrain.cell - north}
+    to = lambda inside, k: (k + (k < 0)) * terrain.cell - inside if k else jnp.zeros_like(inside)
+    to_x = {k: to(east, k) for k in range(-_REACH, _REACH + 1)}
+    to_y = {k: to(north, k) for k in range(-_REACH, _REACH + 1)}
     i, j = i.astype(jnp.int32), j.astype(jnp.int32)
 
     own = _height(terrain, i, j) - p[2]

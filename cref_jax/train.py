@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -22,7 +23,7 @@ from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.progress import Reporter
 from cref_jax.world import World
 
-CRITIC_FIRST = 20  # iterations after --init; assumed: the values fit before the actor moves
+CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
 MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
 
 Device = Literal["auto", "cpu", "gpu"]
@@ -51,8 +52,8 @@ class Options:
     run_dir: Path | None = None
     """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
     init: Path | None = None
-    """an exported policy or a run, as which this run's actor begins; the critic learns alone first
-    """
+    """a run, or an exported policy, as which this run begins; without a critic, or with another,
+    the critic learns alone first"""
     resume: bool = False
     """go on with the run in --run-dir, or with the newest one"""
     print_config: bool = False
@@ -235,10 +236,15 @@ def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
 
 
 def _first_state(world: World, mesh: Mesh, steps: Checkpoints, options: Options) -> learn.RunState:
-    """Return the state to begin with: fresh, with a policy's actor, or of the newest checkpoint."""
+    """Return the state to begin with: fresh, with what was learned, or of the newest checkpoint."""
     state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
     if options.init:
-        return state.replace(train=exported.begun(state.train, exported.load(options.init, world)))
+        policy = exported.load(options.init, world)
+        if _has_critic(options.init, world.config):
+            average = jax.tree.map(jnp.copy, policy.train.average)  # the actor gives its own away
+            learned = policy.train.replace(average=average, iteration=state.train.iteration)
+            return state.replace(train=learned)
+        return state.replace(train=exported.begun(state.train, policy))
     if not options.resume:
         return state
     stored, here = steps.meta(), _sharing(state, mesh)
@@ -304,7 +310,7 @@ def _with_short_options(c: Config, options: Options) -> Config:
 
 
 def _with_init(c: Config, options: Options) -> Config:
-    """Return the settings of a run whose actor begins as that of `--init`.
+    """Return the settings of a run that begins as `--init`.
 
     Raises:
         ConfigError: it has another network, or there is something to resume as well.
@@ -318,8 +324,15 @@ def _with_init(c: Config, options: Options) -> Config:
                 f"--init {options.init} has another network: {name} is {value}, and here "
                 f"{getattr(ours, name)}; set --network.{name.replace('_', '-')}"
             )
-    first = c.ppo.critic_first or CRITIC_FIRST
+    first = c.ppo.critic_first or (0 if _has_critic(options.init, c) else CRITIC_FIRST)
     return dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, critic_first=first))
+
+
+def _has_critic(init: Path, c: Config) -> bool:
+    """Return whether everything that a training learns is in `init`, and not the actor alone."""
+    theirs = exported.read_config(init)
+    read_out = theirs.ppo.readout_weight > 0.0, c.ppo.readout_weight > 0.0
+    return exported.is_run(init) and theirs.network == c.network and read_out[0] == read_out[1]
 
 
 def _name(options: Options) -> str:

@@ -24,6 +24,11 @@ class Cell(NamedTuple):
         had = successes(self.training)
         return successes(self.stand_in) / had if had else float("nan")
 
+    def line(self) -> str:
+        """Return both counts as one line."""
+        counts = lambda c: f"{successes(c)} of {trials(c)}"
+        return f"  training simulation {counts(self.training)}, whole robot {counts(self.stand_in)}"
+
 
 def lanes() -> dict[str, tuple[Lane, ...]]:
     """Return the lanes of flat ground and of each cell of Table II, by the cell's name."""

@@ -38,12 +38,12 @@ def _settled(c: Config, physics: Physics) -> Body:
     flat = terrain.from_heights(jnp.zeros((1, 1)), c.terrain.cell, (0.0, 0.0))
     robot, nominal = physics.robot, physics.nominal_dynamics()
     steps = round(c.episode.settle_time / c.physics.control_period)
-    target = jnp.asarray(robot.nominal_pose)
+    target, rest = jnp.asarray(robot.nominal_pose), jnp.asarray(robot.rest_pose)
 
     def settle(key: PRNGKeyArray) -> Body:
-        joints = target + 0.05 * jax.random.uniform(key, target.shape, minval=-1.0)  # rad
+        joints = rest + 0.05 * jax.random.uniform(key, rest.shape, minval=-1.0)  # rad
         base = jnp.array([0.0, 0.0, robot.standing_height, 1.0, 0.0, 0.0, 0.0])
-        still = jnp.zeros(6 + len(target))
+        still = jnp.zeros(6 + len(rest))
         body = Body(jnp.concatenate([base, joints]), still, still)
         hold = lambda body, _: (
             physics.step(flat, body, jnp.stack([target, target]), jnp.int32(0), nominal)[0],

@@ -2,31 +2,41 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 import tyro
 
 from cref_jax import curves
 
-SMOOTH = 10  # iterations that a point is the mean of
-SHOWN = {
+TITLES = {
     "episode/length_s": "episode length, s",
     "walk/speed_error": "speed error with exploration, m/s",
     "walk/airborne": "share of time a foot is off the ground",
     "walk/reward": "reward a step",
+    "level/gap": "gap, mean level of 9",
+    "level/platform": "platform, mean level of 9",
+    "level/stairs_up": "stairs up, mean level of 9",
+    "level/stairs_down": "stairs down, mean level of 9",
 }
 
 
 @dataclass(frozen=True)
 class Options:
-    """Draw learning curves over the minutes that the iterations took."""
+    """Draw learning curves, one panel a measure."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """folders of runs"""
+    show: tuple[str, ...] = tuple(TITLES)[:4]
+    """columns of the log, such as level/gap"""
+    over: Literal["minutes", "samples"] = "minutes"
+    """of training, without pauses"""
+    smooth: int = 10
+    """iterations that a point is the mean of"""
     out: Path = Path("curves.png")
     """the picture to write"""
 
@@ -34,16 +44,20 @@ class Options:
 def main() -> None:
     """Read each run's log and draw it."""
     options = tyro.cli(Options)
-    figure, axes = plt.subplots(1, len(SHOWN), figsize=(4 * len(SHOWN), 3), constrained_layout=True)
+    size = (4 * len(options.show), 3)
+    figure, axes = plt.subplots(1, len(options.show), figsize=size, constrained_layout=True)
+    axes = np.atleast_1d(axes)
     for run in options.runs:
         log = curves.read(run / "log.jsonl")
-        label = f"{run.name}, {log['train/samples'][-1] / 1e6:.1f} M"
-        for axis, name in zip(axes, SHOWN, strict=True):
-            mean = curves.smooth(log, name, SMOOTH)
-            axis.plot(log.minutes()[SMOOTH - 1 :], mean[SMOOTH - 1 :], label=label)
-    for axis, title in zip(axes, SHOWN.values(), strict=True):
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("minutes")
+        millions = log["train/samples"] / 1e6
+        over = log.minutes() if options.over == "minutes" else millions
+        for axis, name in zip(axes, options.show, strict=True):
+            mean = curves.smooth(log, name, options.smooth)
+            whole = slice(options.smooth - 1, None)
+            axis.plot(over[whole], mean[whole], label=f"{run.name}, {millions[-1]:.1f} M")
+    for axis, name in zip(axes, options.show, strict=True):
+        axis.set_title(TITLES.get(name, name), fontsize=10)
+        axis.set_xlabel("minutes" if options.over == "minutes" else "samples, M")
         axis.set_ylim(bottom=0.0)
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)

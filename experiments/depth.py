@@ -58,9 +58,10 @@ def view(c: config.Config, ground: terrain.Terrain, lift: float) -> np.ndarray:
     heights = np.asarray(terrain.height_at(ground, jnp.stack([x, 0.0 * x], 1)))
     obstacle = x[np.argmax(heights != 0.0)] if heights.any() else 1.5
     base = [obstacle - BEFORE, 0.0, x2.standing_height, 1.0, 0.0, 0.0, 0.0]
-    bent = lift * np.array([name == "left_hip_pitch_joint" for name in x2.joint_names])
-    qpos = jnp.concatenate([jnp.array(base), x2.nominal_pose - bent])
-    tree = kinematics.tree(robot.spec(c.robot.actuated, c.physics).compile())
+    joints = x2.rest_pose.copy()
+    joints[x2.joint_names.index("left_hip_pitch_joint")] -= lift
+    qpos = jnp.concatenate([jnp.array(base), joints])
+    tree = kinematics.tree(robot.spec(robot.moving(c.robot), c.physics).compile())
     links = kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1))
     position, rotation = depth.pose(links, x2.camera, c.camera, 0.0, jnp.zeros(3))
     capsules = depth.capsules_in_view(links, x2.capsules)

@@ -74,6 +74,6 @@ def recorded(count: int, sees: bool = True, seed: int = 0) -> vectors.Recorded:
 
 
 def metres(image: np.ndarray, d_max: float = 3.0) -> np.ndarray:
-    """Return the depth that reads as this image, m; the far plane as a hole."""
+    """Return the depth that reads as this image, m; the far plane as a miss."""
     depth = (image.astype(np.float32) + np.float32(0.5)) * np.float32(d_max)
-    return np.where(image == 0.5, np.nan, np.maximum(depth, 1e-6)).astype(np.float32)
+    return np.where(image == 0.5, np.inf, np.maximum(depth, 1e-6)).astype(np.float32)

@@ -66,20 +66,33 @@ def test_it_says_what_the_network_says_over_1000_steps_with_resets(variant):
     assert max(worst.values()) < 1e-5, worst
 
 
-def test_holes_read_as_the_far_plane_and_millimetres_as_metres(robot):
-    def seen(depth):
-        robot.reset()
-        robot.on_depth(depth, 0.0)
-        robot.step(*still())
-        return robot.tensors()["tokens"]
+def tokens(robot, depth) -> np.ndarray:
+    robot.reset()
+    robot.on_depth(depth, 0.0)
+    robot.step(*still())
+    return robot.tensors()["tokens"]
 
+
+def test_what_is_beyond_reach_reads_as_the_far_plane_and_millimetres_as_metres(robot):
     far, depth = frame(), frame()
     far[:10] = 3.0
-    depth[:4], depth[4:8], depth[8:9], depth[9:10] = 0.0, np.nan, np.inf, 7.0
-    np.testing.assert_array_equal(seen(depth), seen(far))
-    assert np.abs(seen(frame()) - seen(far)).max() > 1e-3
-    millimetres = np.where(np.isfinite(depth), 1000 * depth, 0).astype(np.uint16)
-    np.testing.assert_array_equal(seen(millimetres), seen(far))
+    depth[:5], depth[5:10] = np.inf, 7.0
+    np.testing.assert_array_equal(tokens(robot, depth), tokens(robot, far))
+    assert np.abs(tokens(robot, frame()) - tokens(robot, far)).max() > 1e-3
+    millimetres = np.where(np.isfinite(depth), 1000 * depth, 60_000).astype(np.uint16)
+    np.testing.assert_array_equal(tokens(robot, millimetres), tokens(robot, far))
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan, -1.0])
+def test_level_ground_has_no_holes(robot, nothing):
+    # 1 m over the ground, looking down by 45 degrees: 1 / depth is linear down the image
+    down = np.linspace(-0.4, 0.4, 48)[:, None]
+    depth = np.broadcast_to(np.sqrt(2.0) / (1.0 + down), (48, 64)).astype(np.float32)
+    holes = depth.copy()
+    holes[10:30, 20:50], holes[40:, :15], holes[3], holes[5:8, 60:] = [nothing] * 4
+    np.testing.assert_allclose(tokens(robot, holes), tokens(robot, depth), atol=2e-3)
+    as_far = np.where(holes == depth, depth, 3.0)
+    assert np.abs(tokens(robot, as_far) - tokens(robot, depth)).max() > 0.1
 
 
 @pytest.mark.parametrize(
@@ -223,9 +236,9 @@ def test_targets_move_no_further_than_the_limits():
 
 
 def test_the_guards_on_targets_take_nothing_that_the_motors_can_do():
-    # beyond effort / kp from any pose in range the torque is at its limit already
+    # further from any pose in range the torque is at its limit, even where damping opposes it
     guards = contents(policy("full"))[0]["guards"]
-    reach = ROBOT.effort / ROBOT.kp
+    reach = (ROBOT.effort + ROBOT.kd * ROBOT.velocity_limit) / ROBOT.kp
     np.testing.assert_allclose(guards["beyond_rad"], reach, rtol=1e-6)
     np.testing.assert_allclose(guards["rate_rad"], 2 * reach, rtol=1e-6)
 

@@ -455,14 +455,15 @@ def test_the_camera_turns_with_its_link_and_its_errors_are_in_the_mounts_frame()
 
 def test_capsules_in_view_are_those_of_the_limbs_in_the_world():
     x2 = robot.load(config.Robot())
-    model = robot.spec("legs", config.Physics()).compile()
-    qpos = np.concatenate([[1.0, 2.0, 0.7], LEFT, x2.nominal_pose]).astype(np.float32)
+    moves = robot.moving(config.Robot())
+    model = robot.spec(moves, config.Physics()).compile()
+    qpos = np.concatenate([[1.0, 2.0, 0.7], LEFT, x2.rest_pose]).astype(np.float32)
     tree = kinematics.tree(model)
     links = kinematics.links(tree, jnp.asarray(qpos), jnp.zeros(len(qpos) - 1))
     found = np.asarray(depth.capsules_in_view(links, x2.capsules))
     names = np.array(x2.capsules.names)[x2.capsules.in_view]
     assert found.shape == (len(names), 7)
-    state = mujoco.MjData(robot.spec("legs", config.Physics(), 0, visual=True).compile())
+    state = mujoco.MjData(robot.spec(moves, config.Physics(), 0, visual=True).compile())
     state.qpos[:] = qpos
     mujoco.mj_kinematics(state.model, state)
     for row, name in zip(found, names, strict=True):

@@ -70,7 +70,7 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
     assert asked == [(bundled, 3, 2, 5)]
     record = json.loads((tmp_path / "eval.json").read_text())
     assert record["suite"] == "ood" and record["seed"] == 5
-    assert record["policies"][0]["name"] == "gap"
+    assert record["policies"][0]["name"] == bundled.name
 
 
 @pytest.mark.slow

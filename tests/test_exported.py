@@ -71,6 +71,14 @@ def test_a_policy_comes_back_as_it_went(directory, small_world):
     np.testing.assert_array_equal(say(found.train)["action"], say(was.train)["action"])
 
 
+def test_the_manifest_has_the_command_and_no_one_s_folders(tmp_path):
+    words = ["/home/someone/train.py", "--terrain", "gap", "--run-dir", "/home/someone/runs/gap"]
+    (tmp_path / "origin.jsonl").write_text(json.dumps({"command": words}) + "\n")
+    manifest = exported.manifest(policy("full")._replace(run=tmp_path), ROBOT)
+    command = manifest["provenance"]["trained_by"]["command"]
+    assert command == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
+
+
 def test_the_manifest_says_what_the_engineer_needs():
     manifest = exported.manifest(policy("full"), ROBOT)
     assert [joint["name"] for joint in manifest["joints"]] == list(ROBOT.joint_names)

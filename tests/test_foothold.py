@@ -334,7 +334,7 @@ def test_what_is_2_cm_lower_bears_and_what_is_4_cm_lower_does_not():
 @pytest.mark.parametrize("actuated", ["legs", "all"])
 def test_the_soles_of_a_robot_that_stands_and_turns(actuated):
     # the spheres, of radius 1 cm, lie from x = -5.5 to 12.5 cm about the ankle, 6.34 cm below it
-    x2 = robot.load(config.Robot(actuated=actuated))
+    x2 = robot.load(config.Robot(actuated=actuated, held="none"))
     tree = kinematics.tree(robot.spec(actuated, config.Physics()).compile())
     turn = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.float32(0.7))
     qpos = jnp.concatenate([jnp.array([3.0, -2.0, x2.standing_height]), turn, x2.nominal_pose])
@@ -349,7 +349,7 @@ def test_the_soles_of_a_robot_that_stands_and_turns(actuated):
 
 def test_each_sole_has_its_own_spheres_and_heading():
     # the spheres moved 1 cm forward on the right foot alone, the left hip turned to the left
-    x2 = robot.load(config.Robot())
+    x2 = robot.load(config.Robot(held="none"))
     tree = kinematics.tree(robot.spec("legs", config.Physics()).compile())
     qpos = jnp.concatenate([jnp.array([0.0, 0.0, 0.6, 1.0, 0.0, 0.0, 0.0]), x2.nominal_pose])
     shift = 0.01 * (x2.spheres.foot == 1)[:, None] * np.array([1.0, 0.0, 0.0])

@@ -27,7 +27,7 @@ def state(rotation=LEVEL, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0)):
 
 
 def test_the_parts_follow_each_other_as_in_eq_2():
-    clean = observation.motion(*state(turned([1.0, 0.0, 0.0], 90.0), spin=(1.0, 2.0, 3.0)))
+    clean = observation.motion(*state(turned([1.0, 0.0, 0.0], 90.0), spin=(1.0, 2.0, 3.0)), JOINTS)
     command = jnp.array([0.5, -0.1, 0.2])
     action = jnp.arange(JOINTS) + 100.0
     found = observation.proprioception(clean, command, jnp.full(JOINTS, 0.5), action)
@@ -58,13 +58,15 @@ def test_gravity_tells_the_tilt_and_not_the_heading():
     for heading in (0.0, 70.0, -120.0):
         rotation = geometry.quat_multiply(turned([0.0, 0.0, 1.0], heading), pitched)
         np.testing.assert_allclose(
-            observation.motion(*state(rotation)).gravity, expected, atol=1e-6
+            observation.motion(*state(rotation), JOINTS).gravity, expected, atol=1e-6
         )
 
 
 def test_the_velocity_is_turned_into_the_body_frame_and_the_spin_is_there_already():
     # heading along world y: what goes along world x goes to the right, -y of the body
-    found = observation.motion(*state(turned([0.0, 0.0, 1.0], 90.0), (1.0, 0.0, 0.5), (1, 2, 3)))
+    found = observation.motion(
+        *state(turned([0.0, 0.0, 1.0], 90.0), (1.0, 0.0, 0.5), (1, 2, 3)), JOINTS
+    )
     np.testing.assert_allclose(found.velocity, [0.0, -1.0, 0.5], atol=1e-6)
     np.testing.assert_array_equal(found.angular_velocity, [1.0, 2.0, 3.0])
 
@@ -108,7 +110,7 @@ def test_the_critic_sees_the_clean_observation_then_the_velocity_then_the_height
 
 def test_noise_stays_within_its_bounds_and_reaches_them():
     c = config.Randomisation()
-    clean = observation.motion(*state(velocity=(1.0, 2.0, 3.0)))
+    clean = observation.motion(*state(velocity=(1.0, 2.0, 3.0)), JOINTS)
     noisy = jax.vmap(lambda key: observation.with_noise(clean, c, key))(
         jax.random.split(jax.random.key(0), 2000)
     )

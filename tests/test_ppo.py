@@ -420,7 +420,7 @@ def test_the_learning_rate_scales_the_step():
     np.testing.assert_allclose(largest, losses.learning_rate[0, 0], rtol=1e-2)
 
 
-def test_the_critic_alone_learns_first():
+def test_the_critic_alone_learns_first_and_the_actor_begins_at_the_lowest_rate():
     c = dataclasses.replace(C, critic_first=2)
     state = ppo.initial_state(initial_params(), OBS, CRITIC_OBS, c)
     after = [state]
@@ -429,6 +429,7 @@ def test_the_critic_alone_learns_first():
         after.append(state)
         if len(after) < 4:
             np.testing.assert_allclose(losses.learning_rate, c.learning_rate)
+    np.testing.assert_allclose(losses.learning_rate, c.learning_rate_range[0])
     same = lambda a, b: all(
         np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     )

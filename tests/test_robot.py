@@ -99,10 +99,24 @@ def test_the_right_side_mirrors_the_left_in_pose_and_limits():
 )
 def test_only_the_actuated_joints_move(actuated, nv, nu):
     compiled = robot.spec(actuated, config.Physics()).compile()
-    r = robot.load(config.Robot(actuated=actuated))
+    r = robot.load(config.Robot(actuated=actuated, held="none"))
     assert (compiled.nv, compiled.nu, len(r.joint_names)) == (nv, nu, nu)
     # motor i turns joint i, behind the freejoint
     np.testing.assert_array_equal(compiled.actuator_trnid[:, 0], np.arange(1, nu + 1))
+
+
+@pytest.mark.parametrize(("held", "count"), [("none", 12), ("waist", 15), ("all", 31)])
+def test_joints_that_are_held_come_after_those_that_the_policy_drives(held, count):
+    r, whole = robot.load(config.Robot(held=held)), robot.load(config.Robot(actuated="all"))
+    assert r.joint_names == whole.joint_names[:12]
+    np.testing.assert_array_equal(r.rest_pose, whole.nominal_pose[:count])
+    for name in ("nominal_pose", "kp", "kd", "effort", "velocity_limit", "range_low", "range_high"):
+        np.testing.assert_array_equal(getattr(r, name), getattr(whole, name)[:12])
+
+
+def test_what_is_driven_is_not_held():
+    r = robot.load(config.Robot(actuated="legs+waist", held="waist"))
+    assert len(r.joint_names) == len(r.rest_pose) == 15
 
 
 @pytest.mark.parametrize("actuated", ["legs", "legs+waist"])
@@ -215,7 +229,7 @@ def test_hip_xz_and_ankle_x_are_the_joints_of_table_i():
 
 
 def test_the_camera_sits_in_the_face():
-    r = robot.load(config.Robot())
+    r = robot.load(config.Robot(held="none"))
     _, state = at_nominal_pose("legs", r.standing_height)
     # head_pitch_link: 0.06706 + 0.08801 + 0.3094 + 0.0889 = 0.55337 m over the pelvis
     expected = [0.00835 + 0.0576, 0.0, r.standing_height + 0.55337 - 0.0484]

@@ -95,18 +95,19 @@ def test_a_huge_map_is_thinned_out(monkeypatch):
     np.testing.assert_allclose(seen, np.sin(1.0) + 0.1, atol=1e-3)
 
 
-@pytest.mark.parametrize("actuated", ["legs", "legs+waist"])
-def test_the_links_are_drawn_where_the_physics_has_them(actuated):
-    physics = Physics(config.Robot(actuated=actuated), config.Physics(), "mujoco", threads=1)
+@pytest.mark.parametrize("held", ["none", "waist", "all"])
+def test_the_links_are_drawn_where_the_physics_has_them(held):
+    c = config.Robot(held=held)
+    physics = Physics(c, config.Physics(), "mujoco", threads=1)
     rng = np.random.default_rng(0)
-    joints = physics.robot.nominal_pose + rng.uniform(-0.3, 0.3, len(physics.robot.joint_names))
+    joints = physics.robot.rest_pose + rng.uniform(-0.3, 0.3, len(physics.robot.rest_pose))
     turn = rng.normal(size=4)
     qpos = np.concatenate([[1.0, -0.2, 0.7], turn / np.linalg.norm(turn), joints])
     qpos = qpos.astype(np.float32)
     still = np.zeros(len(joints) + 6, np.float32)
     links = physics.links(Body(jnp.asarray(qpos), jnp.asarray(still), jnp.asarray(still)))
 
-    model = scene.build(actuated, config.Physics(), lane("flat", 0.0))
+    model = scene.build(robot.moving(c), config.Physics(), lane("flat", 0.0))
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -134,8 +135,9 @@ def test_the_camera_follows_a_short_film(count):
 
 def test_the_robot_stands_in_the_middle_of_the_picture():
     data = robot.load(config.Robot())
-    model = scene.build("legs", config.Physics(), lane("stairs_up", 0.15))
-    qpos = np.concatenate([[0.75, 0, data.standing_height, 1, 0, 0, 0], data.nominal_pose])
+    moves = robot.moving(config.Robot())
+    model = scene.build(moves, config.Physics(), lane("stairs_up", 0.15))
+    qpos = np.concatenate([[0.75, 0, data.standing_height, 1, 0, 0, 0], data.rest_pose])
     try:
         canvas = scene.Canvas(model, 192, 108)
     except ConfigError as error:

@@ -61,7 +61,7 @@ def test_it_sees_what_the_robot_sees_in_training():
         at_start = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
         robot = put(at_start, x=x, y=0.0, z=ROBOT.standing_height, rotation=jnp.array(turned))
         robot = robot.replace(
-            body=robot.body._replace(qpos=robot.body.qpos.at[7:].set(ROBOT.nominal_pose))
+            body=robot.body._replace(qpos=robot.body.qpos.at[7:].set(world.physics.robot.rest_pose))
         )
         seen = jax.jit(env.depth_image)(world, robot)
         metres = (np.asarray(seen) + 0.5) * C.camera.d_max

@@ -141,6 +141,15 @@ def test_inside_a_step_the_nearest_way_out_is_taken():
     np.testing.assert_allclose(distance, -0.004, atol=ROUNDING)
 
 
+@pytest.mark.parametrize("depth", [0.005, 0.025, 0.045, 0.059])
+def test_a_foot_that_has_been_thrown_into_a_riser_comes_out_as_it_went_in(depth):
+    # the top is further away; a foot at 8 m/s is 4 cm in after one substep
+    found, normal, distance = closest(step_up(), jnp.array([RISER + depth, MIDDLE, 0.08]))
+    np.testing.assert_allclose(found, [RISER, MIDDLE, 0.08], atol=ROUNDING)
+    np.testing.assert_allclose(normal, [-1.0, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(distance, -depth, atol=ROUNDING)
+
+
 def test_at_a_nosing_the_normal_points_from_the_edge_to_the_sphere():
     # 3 mm before the riser, 4 mm above the tread: 5 mm from the edge
     found, normal, distance = closest(step_up(), jnp.array([RISER - 0.003, MIDDLE, 0.154]))

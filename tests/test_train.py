@@ -117,7 +117,7 @@ def test_a_run_begins_as_a_policy_whose_critic_is_gone(tmp_path: Path):
     exported.write(runs.load_policy(tmp_path / "first", world), world, tmp_path / "policy")
     policy = exported.read(tmp_path / "policy")
     run(tmp_path / "second", "--init", str(tmp_path / "policy"), "--iterations", "1")
-    assert runs.read_config(tmp_path / "second").ppo.critic_first == 20
+    assert runs.read_config(tmp_path / "second").ppo.critic_first == 200
     begun = runs.load_policy(tmp_path / "second", world).train
     for a, b in zip(*(jax.tree.leaves(t.params.actor) for t in (policy.train, begun)), strict=True):
         np.testing.assert_array_equal(a, b)  # the critic alone has learned
@@ -126,6 +126,23 @@ def test_a_run_begins_as_a_policy_whose_critic_is_gone(tmp_path: Path):
     assert int(seen.count) == 576
     drift = np.abs(seen.mean - policy.train.statistics.obs.mean)
     assert np.all(drift < 2.0 * np.asarray(seen.std) + 1e-3)
+
+
+@pytest.mark.slow
+def test_a_run_begins_as_another_run_with_all_that_it_learned(tmp_path: Path):
+    run(tmp_path / "first")
+    run(tmp_path / "second", "--init", str(tmp_path / "first"), "--iterations", "1")
+    assert runs.read_config(tmp_path / "second").ppo.critic_first == 0
+    log = [json.loads(line) for line in (tmp_path / "second" / "log.jsonl").open()]
+    assert log[0]["iteration"] == 1
+    world = runs.world_of(runs.read_config(tmp_path / "first"))
+    before, after = (runs.load_policy(tmp_path / n, world).train for n in ("first", "second"))
+    # 2 iterations of 8 x 24 samples, then one more
+    assert int(before.statistics.critic_obs.count) == 384
+    assert int(after.statistics.critic_obs.count) == 576
+    critics = [jax.tree.leaves(t.params.critic) for t in (before, after)]
+    moved = max(float(np.abs(a - b).max()) for a, b in zip(*critics, strict=True))
+    assert 0.0 < moved < 0.1
 
 
 @pytest.mark.slow

@@ -32,6 +32,11 @@ def test_kept_is_the_share_of_the_successes_of_the_training_simulation():
     assert math.isnan(transfer.Cell("gap", (crossing(0),), (crossing(1),)).kept)
 
 
+def test_a_cell_says_both_counts_in_a_line():
+    cell = transfer.Cell("stairs", (crossing(50), crossing(40)), (crossing(45), crossing(36)))
+    assert cell.line() == "  training simulation 90 of 100, whole robot 81 of 100"
+
+
 def test_the_table_pools_both_ways_with_an_interval_and_causes():
     row = shown(
         transfer.Cell(

@@ -140,10 +140,8 @@ class Policy:
         self._mean, self._std = obs.reals("mean", size), obs.reals("std", size, 1e-9)
         self._clip = obs.real("clip", 1e-3, 1e6)
         self._action_clip = root.table("action").real("clip", 1e-3, 1e6)
-        self._command = (
-            root.table("command").reals("low", 3),
-            root.table("command").reals("high", 3),
-        )
+        command = root.table("command")
+        self._command = command.reals("low", 3), command.reals("high", 3)
         self._hold_steps = guards.whole("hold_steps", 0, 1000)
         self._stale = guards.real("stale_s", 1e-3, 10.0)
         self._invalid = guards.real("max_invalid", 0.0, 1.0)
@@ -179,8 +177,9 @@ class Policy:
     def on_depth(self, depth: Any, stamp: Any) -> Status:
         """Take a frame: z-depth [H, W] in metres, or uint16 in millimetres; row 0 is the top.
 
-        `stamp` is when it was exposed, s, on the clock of `step`. Pixels that are 0 or not finite
-        are holes; they and everything further than d_max read as d_max, as a miss did in training.
+        `stamp` is when it was exposed, s, on the clock of `step`. What is further than d_max, even
+        infinitely, reads as d_max, as a miss did in training. Pixels that are 0 or NaN are holes,
+        filled in from around them.
         """
         with np.errstate(all="ignore"):
             return self._see(depth, stamp)
@@ -234,11 +233,15 @@ class Policy:
         metres = frame.astype(np.float32)
         if frame.dtype == np.uint16:
             metres /= np.float32(1000.0)
-        valid = np.isfinite(metres) & (metres > 0.0)
+        valid = metres > 0.0  # and no NaN
         if 1.0 - valid.mean() > self._invalid:
             return Status.INVALID_DEPTH
         far = np.float32(self._d_max)
-        image = np.where(valid, np.minimum(metres, far), far) / far - np.float32(0.5)
+        share = np.where(valid, np.minimum(metres, far), far) / far
+        if not valid.all():
+            # 1 / depth of a plane is linear in the image: level ground is filled in as it is
+            share = np.where(valid, share, 1.0 / _filled(1.0 / share, valid))
+        image = (share - 0.5).astype(np.float32)
         encoded = self._encoder(image.astype(np.float16).astype(np.float32))  # as training had it
         with self._lock:
             self._actor.look(*encoded)
@@ -332,11 +335,8 @@ class _Encoder:
         self._place = tokenizer.take("place", rows * columns, width)
         self._norm = _Norm(tokenizer, width)
         self._blocks = (shape[0] // 8, 8, shape[1] // 8, 8)
-        cells = self._blocks[0] * self._blocks[2]
-        compressed = net.whole("compressed", 1, 4096)
-        self._compression = _Dense(
-            weights, "depth_compression/layer_0", cells, compressed, elu=True
-        )
+        blocks, out = self._blocks[0] * self._blocks[2], net.whole("compressed", 1, 4096)
+        self._compression = _Dense(weights, "depth_compression/layer_0", blocks, out, elu=True)
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the tokens [N, D] and the compressed depth [C] of D [H, W]."""
@@ -361,15 +361,12 @@ class _Actor:
         shrink = [stride for _, _, stride in _convolutions(net, shape)] if self._sees else []
         tokens = int(np.prod(shape) // np.prod(shrink) ** 2) if self._sees else 0
         self._tokens = np.zeros((tokens, width), np.float32)
-        self._query = None
-        if self._sees:
-            attends = variant != "no_cross_attention"
+        self._query: _Attention | _Pooled | None = None
+        if variant == "no_cross_attention":
+            self._query = _Pooled(weights.under("pooled_tokens"), width)
+        elif self._sees:
             heads = net.whole("heads", 1, 64)
-            self._query = (
-                _Attention(weights.under("cross_attention"), width, heads, tokens)
-                if attends
-                else _Pooled(weights.under("pooled_tokens"), width)
-            )
+            self._query = _Attention(weights.under("cross_attention"), width, heads, tokens)
         hidden = net.whole("lstm", 1, 4096)
         self._lstm = _Lstm(weights.under("velocity_estimator"), size + compressed, hidden)
         known = size + 3, width, width
@@ -649,6 +646,15 @@ class _Norm:
         centred *= self._scale / np.sqrt(variance + np.float32(1e-6))
         centred += self._bias
         return centred
+
+
+def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return an image [H, W] with lines along rows, then columns, between the known pixels."""
+    row, column, lines = np.arange(len(values)), np.arange(values.shape[1]), values.copy()
+    some = np.flatnonzero(known.any(axis=1))
+    for i in some:
+        lines[i] = np.interp(column, column[known[i]], values[i, known[i]])
+    return np.stack([np.interp(row, some, lines[some, j]) for j in column], axis=1)
 
 
 def _vector(value: Any, size: int) -> np.ndarray | None:
@@ -970,11 +976,9 @@ def _replay(policy: Policy, vectors: dict[str, np.ndarray], errors: dict[str, fl
 
 def report(times: dict[str, np.ndarray]) -> list[str]:
     """Return the latencies that `self_test` has measured, in lines for people."""
-    lines = []
-    for name, seconds in times.items():
-        p50, p99, most = 1e3 * np.percentile(seconds, (50, 99, 100))
-        lines.append(f"{name}: p50 {p50:.2f} ms, p99 {p99:.2f} ms, max {most:.2f} ms")
-    return lines
+    of = lambda seconds: 1e3 * np.percentile(seconds, (50, 99, 100))
+    text = "{}: p50 {:.2f} ms, p99 {:.2f} ms, max {:.2f} ms"
+    return [text.format(name, *of(seconds)) for name, seconds in times.items()]
 
 
 def main() -> None:
@@ -988,8 +992,8 @@ def main() -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     print(f"{path} says what it said in training, to {TOLERANCE:g}")
-    print(f"Python {sys.version.split()[0]}, numpy {np.__version__}")
-    print("\n".join(report(times)))
+    version = f"Python {sys.version.split()[0]}, numpy {np.__version__}"
+    print("\n".join([version, *report(times)]))
 
 
 if __name__ == "__main__":
