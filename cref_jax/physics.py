@@ -68,7 +68,7 @@ class Physics:
         self.feet = np.array(self.robot.ankles)  # body ids
         spec = robot.spec(robot.moving(robot_config), physics_config)
         if engine == "mujoco":
-            _add_force_sensors(spec)
+            robot.add_force_sensors(spec)
         self.model = spec.compile()
         self.tree = kinematics.tree(self.model)
         self.engine: Engine = (
@@ -147,18 +147,6 @@ def resolve_engine(name: EngineName) -> Literal["mjx", "mujoco"]:
     if name != "auto":
         return name
     return "mujoco" if jax.default_backend() == "cpu" else "mjx"
-
-
-def _add_force_sensors(spec: mujoco.MjSpec) -> None:
-    """Add a sensor of the net contact force, in the world frame, to each foot."""
-    for side in ("left", "right"):
-        spec.add_sensor(
-            name=f"{side}_foot_force",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=f"{side}_ankle_roll_link",
-            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],  # net force
-        )
 
 
 class _MjxEngine:

@@ -166,6 +166,18 @@ def spec(
     return s
 
 
+def add_force_sensors(spec: mujoco.MjSpec) -> None:
+    """Add sensors of the net contact force that each foot exerts, in the world frame."""
+    for side in ("left", "right"):
+        spec.add_sensor(
+            name=f"{side}_foot_force",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=f"{side}_ankle_roll_link",
+            intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],  # net force
+        )
+
+
 def nominal_angle(joint: str) -> float:
     """Return q0 of a joint by its name, rad; turns about x and z are mirrored on the right."""
     side, _, kind = joint.removesuffix("_joint").partition("_")

@@ -164,18 +164,22 @@ class StandIn:
         depth = np.where(distance < 0.0, np.inf, distance * self.rays[:, 2])
         return depth.reshape(camera.shape).astype(np.float32)
 
-    def feet_on_ground(self, state: mujoco.MjData) -> tuple[Float[np.ndarray, "2 3"], bool]:
-        """Return the force on each foot, N, and whether a part that is kept clear has come down."""
-        force, hit, one = np.zeros((2, 3)), False, np.zeros(6)
-        for k, contact in enumerate(state.contact):
-            hit |= not self.kept_clear.isdisjoint(contact.geom)
-            bodies = self.model.geom_bodyid[contact.geom]  # the ground's is 0
-            if bodies.max() in self.feet:
-                mujoco.mj_contactForce(self.model, state, k, one)  # on the second geom
-                sign = 1.0 if bodies[1] else -1.0
-                foot = self.feet.index(bodies.max())
-                force[foot] += sign * contact.frame.reshape(3, 3).T @ one[:3]
-        return force, hit
+    def advance(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
+        """Advance one control step; return the mean force on each foot, N, as in training."""
+        substeps, force = self.config.physics.substeps, np.zeros((2, 3))
+        for _ in range(substeps):
+            mujoco.mj_step(self.model, state)
+            force += self.foot_force(state) / substeps
+        mujoco.mj_forward(self.model, state)  # poses and contacts of this moment, not of the last
+        return force
+
+    def foot_force(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
+        """Return the force of the ground on each foot at the last evaluation, N."""
+        return -state.sensordata.reshape(2, 3)
+
+    def is_hit(self, state: mujoco.MjData) -> bool:
+        """Return whether a part that is kept clear has come down."""
+        return not self.kept_clear.isdisjoint(state.contact.geom.ravel())
 
 
 class _Judge:
@@ -190,23 +194,22 @@ class _Judge:
         )
         self._support = state.qpos[2] - body.config.reward.base_height_target
 
-    def ending(self, state: mujoco.MjData) -> str | None:
+    def ending(self, state: mujoco.MjData, force: Float[np.ndarray, "2 3"]) -> str | None:
         """Return the first reason to end, or None; to be asked after every control step."""
         c, episode, body = self._c, self._c.episode, self._body
         if any(warning.number for warning in state.warning):
             return "unstable"
-        force, hit = body.feet_on_ground(state)
         foot_z = state.xpos[body.feet, 2]
         on_ground = np.linalg.norm(force, axis=1) > c.reward.contact_force
         bearing = force[:, 2] > c.reward.support_force
-        if on_ground.any() and bearing.any():
-            self._support = float(foot_z[bearing].mean())
+        if on_ground.any():
+            self._support = float(foot_z[bearing].mean() if bearing.any() else foot_z.min())
         x, y, z = state.qpos[:3]
         upright = state.xmat[body.robot.pelvis].reshape(3, 3)[2, 2]
         reasons = {
             "tilted": upright < math.cos(episode.max_tilt),
             "low": z - self._support < episode.min_height,
-            "hit": hit,
+            "hit": body.is_hit(state),
             "dropped": foot_z.min() < self._support - episode.below_edge,
             "strayed": abs(y) > 0.5 * body.ground.width,
             "finished": x > body.ground.end,
@@ -253,11 +256,9 @@ def run(
         if not policy.blind and _is_due(t + latency, c) and not channel.loses_one():
             channel.send(body.image(state), t, t * period)
         state.ctrl[body.driven] = target
-        for _ in range(c.physics.substeps):
-            mujoco.mj_step(body.model, state)
-        mujoco.mj_forward(body.model, state)  # poses and forces of this moment, not of the last
+        force = body.advance(state)
         speeds.append(float(turned[:, 0] @ state.qvel[:3]))
-        ending = judge.ending(state)
+        ending = judge.ending(state, force)
         if ending:
             break
     return Trial(
@@ -322,4 +323,5 @@ def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> muj
         geom.contype = int(touches or geom.name in solid)
         geom.friction = [friction, 0.005, 0.0001]
     ground.add_to(spec, friction)
+    robot.add_force_sensors(spec)
     return spec

@@ -274,6 +274,11 @@ def test_a_foot_stands_across_slots_that_its_spheres_would_sink_into(scene):
     assert sunk[True] < 0.01 < 0.03 < sunk[False]
 
 
+def judged(body, state):
+    """Return how a trial that begins at the nominal pose ends in this state."""
+    return stand_in._Judge(body, placed(body)).ending(state, body.foot_force(state))
+
+
 def rail(y):
     """Return a rail along the path at the height of the hands."""
     return f"[[cylinder]]\nends = [[0.2, {y}, 0.6], [5.0, {y}, 0.6]]\nradius = 0.02\n"
@@ -301,12 +306,12 @@ def test_a_rail_stops_a_hand_which_is_no_fall(scene):
     state = placed(body)
     links = {body.model.body(body.model.geom_bodyid[g]).name for g in state.contact.geom.ravel()}
     assert any("wrist" in link for link in links)
-    assert stand_in._Judge(body, state).ending(state) is None
+    assert judged(body, state) is None
 
 
 def test_the_torso_in_a_rail_is_a_hit(scene):
     body = on(scene(rail(0.0).replace("0.6", "0.95")))
-    assert stand_in._Judge(body, placed(body)).ending(placed(body)) == "hit"
+    assert judged(body, placed(body)) == "hit"
 
 
 @pytest.mark.parametrize(
@@ -314,14 +319,14 @@ def test_the_torso_in_a_rail_is_a_hit(scene):
 )
 def test_a_trial_in_a_scene_ends_at_its_end_or_beside_it(scene, changes, ending):
     body = on(scene(""))
-    assert stand_in._Judge(body, placed(body)).ending(placed(body, **changes)) == ending
+    assert judged(body, placed(body, **changes)) == ending
 
 
 def test_who_does_not_come_forward_stalls_after_ten_seconds(scene):
     body = on(scene(""))
     state = placed(body)
     judge = stand_in._Judge(body, state, speed=0.5)
-    endings = [judge.ending(state) for _ in range(501)]
+    endings = [judge.ending(state, body.foot_force(state)) for _ in range(501)]
     assert endings.index("stalled") == 499  # 500 control steps after the first state
 
 
