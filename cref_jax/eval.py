@@ -43,7 +43,7 @@ class Options:
     kind: str = "gap"
     """of the obstacles to cross: gap, stairs_up, stairs_down, platform, rough, slope, flat"""
     size: float = 0.3
-    """of the obstacles to cross, m"""
+    """of the obstacles to cross, m; of a slope its gradient"""
     num_envs: int | None = None
     """trials of each cell, or episodes; when left out 100 on a CPU and 2000 on an accelerator; of
     each scene 10"""

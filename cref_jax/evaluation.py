@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import lanes, ppo, rollout, trials
+from cref_jax import lanes, ppo, rollout, shapes, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
@@ -47,7 +47,7 @@ class Crossing(NamedTuple):
     """The outcome of trials on lanes of one kind with obstacles of one size."""
 
     kind: str
-    size_m: float
+    size_m: float  # of a slope its gradient
     trials: int
     successes: int  # came to the lane's end in time
     by_cause: dict[str, int]  # of the failures
@@ -58,8 +58,8 @@ class Crossing(NamedTuple):
         """Return the outcome in one line for people."""
         causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
         return (
-            f"{self.kind} {100 * self.size_m:.0f} cm: {self.successes} of {self.trials} trials "
-            f"crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
+            f"{self.kind} {shapes.extent(self.kind, self.size_m)}: {self.successes} of "
+            f"{self.trials} trials crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
             + (f"; failures: {causes}" if causes else "")
         )
 

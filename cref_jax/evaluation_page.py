@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cref_jax import outcomes, page
+from cref_jax import outcomes, page, shapes
 from cref_jax.config import ConfigError
 from cref_jax.outcomes import Failures, Line, Share, called
 from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
@@ -146,7 +146,7 @@ def _success(record: Record, cells: Sequence[Record]) -> Html:
         row = [
             str(cell["kind"]),
             str(cell["level"]),
-            _centimetres(cell.get("size_m")),
+            _size(cell),
             f"{cell['successes']} of {cell['trials']}",
             element("strong", _percent(cell["rate"])),
             _interval(cell),
@@ -289,16 +289,16 @@ def _causes(name: str, of: Record) -> Failures:
 def _name(cell: Record) -> str:
     """Return the kind, level and size of a cell, as far as they are known."""
     words = " ".join(str(cell[key]) for key in ("kind", "level") if key in cell)
-    size = cell.get("size_m")
-    return f"{words}, {_centimetres(size)}" if size else words
+    return f"{words}, {_size(cell)}" if cell.get("size_m") else words
 
 
 def _called(scene: Record) -> str:
     return str(scene.get("title") or scene["name"])
 
 
-def _centimetres(size: Number | None) -> str:
-    return MISSING if size is None else f"{100.0 * size:.3g} cm"
+def _size(cell: Record) -> str:
+    size = cell.get("size_m")
+    return MISSING if size is None else shapes.extent(str(cell.get("kind")), size)
 
 
 def _paper(rate: Number, theirs: Number | None) -> str:

@@ -183,6 +183,11 @@ KINDS: dict[str, Kind] = {
 }
 
 
+def extent(kind: str, size: float) -> str:
+    """Return a size for people: that of a slope is its gradient, all others are lengths."""
+    return f"{100.0 * size:.3g} {'%' if kind == 'slope' else 'cm'}"
+
+
 def columns(metres: float, c: config.Terrain) -> int:
     """Return how many columns a length takes, rounded up: an obstacle is never made easier."""
     return int(np.ceil(metres / c.cell - 1e-6))

@@ -42,7 +42,7 @@ class Options:
     kind: str = "flat"
     """of the lane: flat, gap, stairs_up, stairs_down, platform, rough, slope"""
     size: float = 0.0
-    """of the obstacles, m"""
+    """of the obstacles, m; of a slope its gradient"""
     trials: int = 100
     """of up to 40 s"""
     seed: int = 0

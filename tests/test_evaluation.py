@@ -71,3 +71,13 @@ def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
     c = evaluation.evaluation_config(Config())
     assert not c.randomisation.enabled and not c.curriculum.enabled
     assert c.command.lane_vx == (0.4, 0.8) and c.command.open_kinds == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "begin"),
+    [("gap", 0.305, "gap 30.5 cm: 9 of"), ("slope", 0.35, "slope 35 %: 9")],
+)
+def test_a_size_is_said_in_its_unit(kind, size, begin):
+    outcome = evaluation.Crossing(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
+    assert outcome.line().startswith(begin)
+    assert outcome.line().endswith("failures: 1 low")
