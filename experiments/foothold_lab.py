@@ -11,6 +11,8 @@ Half the robots meet a flight up, half a flight down: hard stairs, 20 cm rise, 3
 A touchdown is that of either foot on a tread, after at least AIR in the air, of a robot that has
 not failed. Its position is that of the sole's centre, from the tread's nosing (0) towards its riser
 (30 cm), on the way up as on the way down. MAD is the median absolute deviation from the median.
+d_xz is what the foothold reward looks at: how far the nearest candidate is that was frozen at
+liftoff, across the lane not counted; none where no window was accepted.
 
 A riser collision begins when a contact sphere touches a riser that faces the robot, or its nosing:
 the surface nearest to the sphere is nearer than its radius, and its normal points back along the
@@ -54,7 +56,7 @@ BIN = 0.01  # m
 PAPER = {"ours": 1.4, "FCQR": 2.8, "NoFR": 9.8}  # cm, MAD in descent, Sec. III-B
 NONE = "no touchdown"
 WAYS = {profile.UP: "ascent", profile.DOWN: "descent"}
-COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm")
+COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm", "d_xz_cm")
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,7 @@ class Step(NamedTuple):
     sole: Float[Array, "E F 3"]  # m, centre of the sole
     touchdown: Bool[Array, "E F"]
     air_time: Float[Array, "E F"]  # s in the air before this step
+    distance: Float[Array, "E F"]  # m, d_xz; inf where there is no candidate
     foot_riser: Bool[Array, "E F"]  # the foot touches a riser that faces the robot
     shank_riser: Bool[Array, "E F"]
 
@@ -96,6 +99,7 @@ class Way(NamedTuple):
     foot: np.ndarray  # 0 left, 1 right
     time: np.ndarray  # s
     position: np.ndarray  # m
+    distance: np.ndarray  # m, d_xz; inf where there was no candidate
     foot_riser: int  # collisions
     shank_riser: int
     collided: int  # robots that had one
@@ -105,6 +109,7 @@ class Way(NamedTuple):
         n = len(self.position)
         spread = f", median {100 * np.median(self.position):.1f} cm" if n else ""
         spread += f", MAD {100 * deviation(self.position):.1f} cm" if n else ""
+        spread += f", median d_xz {100 * np.median(self.distance):.1f} cm" if n else ""
         return f"{self.came()}, {n} touchdowns{spread}"
 
     def came(self) -> str:
@@ -181,6 +186,7 @@ def look(world: World, moment: Moment) -> Step:
         sole=soles,
         touchdown=moment.outcome.measures.touchdown,
         air_time=moment.robots.env.air_time,
+        distance=moment.outcome.measures.foothold_distance,
         foot_riser=of(spheres.foot >= 0),
         shank_riser=of(spheres.foot < 0),
     )
@@ -226,6 +232,7 @@ def summed(world: World, watched: Watched) -> dict[int, Way]:
             foot=foot[landed],
             time=(t[landed] + 1) * period,
             position=position[landed],
+            distance=seen.distance[t[landed], robot[landed], foot[landed]],
             foot_riser=int(foot_hits[:, there].sum()),
             shank_riser=int(shank_hits[:, there].sum()),
             collided=int((foot_hits | shank_hits)[:, there].any(axis=(0, 2)).sum()),
@@ -243,8 +250,10 @@ def rows(found: dict[str, dict[int, Way]]) -> Iterator[tuple]:
     for label, ways in found.items():
         for way, name in WAYS.items():
             w = ways[way]
-            for n, foot, time, position in zip(w.robot, w.foot, w.time, w.position, strict=True):
-                yield label, name, n, ("left", "right")[foot], time, 100 * position
+            columns = (w.robot, w.foot, w.time, w.position, w.distance)
+            for n, foot, time, position, d in zip(*columns, strict=True):
+                away = 100 * d if np.isfinite(d) else ""
+                yield label, name, n, ("left", "right")[foot], time, 100 * position, away
 
 
 def draw(out: Path, found: dict[str, dict[int, Way]], options: Options) -> None:

@@ -129,7 +129,7 @@ def test_median_absolute_deviation():
     assert foothold_lab.deviation(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == 1.0
 
 
-def stairs_steps(touchdown, air_time, x, z, riser):
+def stairs_steps(touchdown, air_time, x, z, riser, distance):
     """Return one robot on each lane with its left foot at (x, z); the right one hangs still."""
     count = len(x)
     both = lambda left, still: np.stack(
@@ -141,6 +141,7 @@ def stairs_steps(touchdown, air_time, x, z, riser):
         sole=sole,
         touchdown=both(touchdown, False),
         air_time=both(air_time, 0.0),
+        distance=both(distance, np.inf),
         foot_riser=both(riser, False),
         shank_riser=both(np.zeros(count, bool), False),
     )
@@ -152,23 +153,27 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     tread = int(np.flatnonzero(p.flight == UP)[0])
     x = np.full(5, p.left[tread] + 0.1)
     seen = stairs_steps(
-        touchdown=np.array([True, False, True, False, True]),
-        air_time=np.array([0.2, 0.0, 0.02, 0.0, 0.2]),  # the second is a foot that rocks
+        touchdown=np.array([True, True, True, False, True]),
+        air_time=np.array([0.2, 0.2, 0.02, 0.0, 0.2]),  # the third is a foot that rocks
         x=x,
         z=np.full(5, p.height[tread]),
         riser=np.array([True, True, False, True, True]),  # begins twice while it lives
+        distance=np.array([0.3, np.inf, 0.1, 0.1, 0.1]),  # the second has no candidate
     )
     alive = np.array([[True, False]] * 4 + [[False, False]])
     world = SimpleNamespace(lanes=atlas, config=Config())
     ways = foothold_lab.summed(world, Watched(alive, seen))
     up, down = ways[UP], ways[DOWN]
     assert (up.robots, up.reached, up.crossed) == (1, 1, 0)
-    np.testing.assert_allclose(up.position, [0.1], atol=1e-6)
-    assert (up.robot.tolist(), up.foot.tolist(), up.time.tolist()) == ([0], [0], [0.02])
+    np.testing.assert_allclose(up.position, [0.1, 0.1], atol=1e-6)
+    assert (up.robot.tolist(), up.foot.tolist()) == ([0, 0], [0, 0])
+    assert (up.time.tolist(), up.distance.tolist()) == ([0.02, 0.04], [0.3, np.inf])
     assert (up.foot_riser, up.shank_riser, up.collided) == (2, 0, 1)
     assert (down.robots, len(down.position), down.collided) == (1, 0, 0)
     table = list(foothold_lab.rows({"mine": ways}))
-    assert table == [("mine", "ascent", 0, "left", 0.02, pytest.approx(10.0, abs=1e-4))]
+    ten = pytest.approx(10.0, abs=1e-4)
+    assert table[0] == ("mine", "ascent", 0, "left", 0.02, ten, pytest.approx(30.0))
+    assert table[1:] == [("mine", "ascent", 0, "left", 0.04, ten, "")]
 
 
 def test_toes_touch_a_riser_once_they_are_at_it(world):
