@@ -106,11 +106,15 @@ class Way(NamedTuple):
 
     def line(self) -> str:
         """Return the touchdowns in one line for people."""
-        n = len(self.position)
-        spread = f", median {100 * np.median(self.position):.1f} cm" if n else ""
-        spread += f", MAD {100 * deviation(self.position):.1f} cm" if n else ""
-        spread += f", median d_xz {100 * np.median(self.distance):.1f} cm" if n else ""
-        return f"{self.came()}, {n} touchdowns{spread}"
+        said = f"{self.came()}, {len(self.position)} touchdowns"
+        if not len(self.position):
+            return said
+        nearest = 100 * np.median(self.distance)
+        return (
+            f"{said}, median {100 * np.median(self.position):.1f} cm, "
+            f"MAD {100 * deviation(self.position):.1f} cm, median d_xz "
+            + (f"{nearest:.1f} cm" if np.isfinite(nearest) else "none: half had no candidate")
+        )
 
     def came(self) -> str:
         """Return how many robots came onto the flight, and how many over it."""

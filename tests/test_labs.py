@@ -168,6 +168,11 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     np.testing.assert_allclose(up.position, [0.1, 0.1], atol=1e-6)
     assert (up.robot.tolist(), up.foot.tolist()) == ([0, 0], [0, 0])
     assert (up.time.tolist(), up.distance.tolist()) == ([0.02, 0.04], [0.3, np.inf])
+    said = "2 touchdowns, median 10.0 cm, MAD 0.0 cm, median d_xz"
+    assert up.line().endswith(f"{said} none: half had no candidate")
+    nearer = up._replace(distance=np.array([0.3, 0.1]))
+    assert nearer.line().endswith(f"{said} 20.0 cm")
+    assert down.line().endswith("0 touchdowns")
     assert (up.foot_riser, up.shank_riser, up.collided) == (2, 0, 1)
     assert (down.robots, len(down.position), down.collided) == (1, 0, 0)
     table = list(foothold_lab.rows({"mine": ways}))
