@@ -255,7 +255,7 @@ def _frames(world: World, robots: rollout.Robots) -> Any:
 
     def render(state: env.EnvState, _: None) -> tuple[env.EnvState, None]:
         images = rollout.exposed(world, state)
-        moved = 1e-9 * images.sum(axis=(1, 2), dtype=jnp.float32)  # or it would be hoisted
+        moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
         return state.replace(camera_pitch=state.camera_pitch + moved), None
 
     return jax.lax.scan(render, robots.env, None, length=count)[0]

@@ -103,6 +103,12 @@ def most_frames(steps: int, camera: config.Camera, control_period: float) -> int
     return -(-steps * frames // period)
 
 
+def longest_hold(camera: config.Camera, control_period: float) -> int:
+    """Return the largest number of control steps from one frame to the next."""
+    frames, steps = _frames(camera, control_period)
+    return -(-steps // frames)
+
+
 class _Eye(NamedTuple):
     """Where a camera is on the grid. Scalars: XLA then makes one loop over all rays of all cameras.
 

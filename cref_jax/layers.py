@@ -9,13 +9,40 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cref_jax import recurrent
+
+_EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's own
 
 
 def dense(features: int, name: str, **settings: Any) -> nn.Dense:
     """Return a dense layer that knows the quicker gradient of its product."""
     return nn.Dense(features, dot_general=_dot_general, name=name, **settings)
+
+
+@jax.custom_vjp
+def elu(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return x where it is above 0, and e^x - 1 elsewhere.
+
+    The derivative is read off the result, y + 1 below 0, so that nothing but the result is kept for
+    the gradient and no exponential is taken twice.
+    """
+    return jnp.where(x > 0.0, x, jnp.exp(jnp.minimum(x, 0.0)) - 1.0)
+
+
+def _elu_forward(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    y = elu(x)
+    return y, y
+
+
+def _elu_backward(y: Float[Array, "*n"], g: Float[Array, "*n"]) -> tuple[Float[Array, "*n"]]:
+    return (g * jnp.where(y > 0.0, 1.0, y + 1.0),)
+
+
+elu.defvjp(_elu_forward, _elu_backward)
 
 
 class MLP(nn.Module):
@@ -32,7 +59,7 @@ class MLP(nn.Module):
         """Return the last layer's output."""
         *hidden, last = self.widths
         for i, width in enumerate(hidden):
-            x = nn.elu(dense(width, name=f"layer_{i}")(x))
+            x = elu(dense(width, name=f"layer_{i}")(x))
         init = nn.linear.default_kernel_init
         if self.scale is not None:
             init = nn.initializers.orthogonal(self.scale)
@@ -66,6 +93,86 @@ class Convolution(nn.Module):
         return dense(self.channels, name="filter")(jnp.concatenate(patches, axis=-1))
 
 
+class PatchFilter(nn.Module):
+    """A convolution without overlap, on patches: one product for all of them.
+
+    Its parameters are those of `Convolution`. The outputs of `group` successive patches stand side
+    by side, as the next filter reads them.
+    """
+
+    channels: int
+    group: int = 1
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "patches I"]) -> Float[Array, "groups gO"]:
+        """Return the filtered patches."""
+        kernel, bias = _Filter(self.channels, name="filter")(x.shape[-1])
+        # a product, not a tile: XLA would look each number of the bias up by its index, and a loop
+        # with such an index in it does not vectorise
+        again = np.tile(np.eye(self.channels, dtype=np.float32), self.group)
+        bias = jnp.matmul(bias, again, precision=jax.lax.Precision.HIGHEST)
+        return product(x, kernel).reshape(-1, self.group * self.channels) + bias
+
+
+class _Filter(nn.Module):
+    """The parameters of a dense layer."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, inputs: int) -> tuple[Float[Array, "I O"], Float[Array, " O"]]:
+        """Return kernel and bias."""
+        shape = inputs, self.features
+        kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
+        return kernel, self.param("bias", nn.initializers.zeros, shape[1:])
+
+
+class LayerNorm(nn.Module):
+    """Normalisation of the last axis to mean 0 and variance 1, then scaled and shifted."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
+        """Return the normalised x."""
+        shape = x.shape[-1:]
+        scale = self.param("scale", nn.initializers.ones, shape)
+        return _normalised(x, scale, self.param("bias", nn.initializers.zeros, shape))
+
+
+@jax.custom_vjp
+def _normalised(
+    x: Float[Array, "*n D"], scale: Float[Array, " D"], bias: Float[Array, " D"]
+) -> Float[Array, "*n D"]:
+    """Return (x - mean) / sqrt(variance + 1e-6) * scale + bias.
+
+    Only x and two numbers a row are kept for the gradient, which passes over x as few times as can
+    be: a tokenizer's normalisation moves more memory than its products.
+    """
+    return _normalised_forward(x, scale, bias)[0]
+
+
+def _normalised_forward(
+    x: Float[Array, "*n D"], scale: Float[Array, " D"], bias: Float[Array, " D"]
+) -> tuple[Float[Array, "*n D"], tuple[Array, Array, Array, Array]]:
+    mean = x.mean(axis=-1, keepdims=True)
+    variance = jnp.square(x).mean(axis=-1, keepdims=True) - jnp.square(mean)
+    inverse = jax.lax.rsqrt(jnp.maximum(variance, 0.0) + _EPSILON)
+    return (x - mean) * inverse * scale + bias, (x, mean, inverse, scale)
+
+
+def _normalised_backward(
+    kept: tuple[Array, Array, Array, Array], g: Float[Array, "*n D"]
+) -> tuple[Float[Array, "*n D"], Float[Array, " D"], Float[Array, " D"]]:
+    x, mean, inverse, scale = kept
+    unit, scaled = (x - mean) * inverse, g * scale
+    shift = scaled.mean(axis=-1, keepdims=True)
+    stretch = (scaled * unit).mean(axis=-1, keepdims=True)
+    rows = tuple(range(x.ndim - 1))
+    return inverse * (scaled - shift - unit * stretch), (g * unit).sum(rows), g.sum(rows)
+
+
+_normalised.defvjp(_normalised_forward, _normalised_backward)
+
+
 class LSTM(nn.Module):
     """A long short-term memory, gates in the order input, forget, candidate, output.
 
@@ -86,18 +193,14 @@ class LSTM(nn.Module):
         inputs = dense(4 * self.hidden, name="input")(x)
         kernel = self.param("recurrent", _stacked_orthogonal, (self.hidden, 4 * self.hidden))
 
-        def step(
-            memory: tuple[Float[Array, "E H"], Float[Array, "E H"]],
-            xs: tuple[Float[Array, "E G"], Bool[Array, " E"]],
-        ) -> tuple[tuple[Float[Array, "E H"], Float[Array, "E H"]], Float[Array, "E H"]]:
-            x, begin = xs
-            c, h = (jnp.where(begin[:, None], 0.0, m) for m in memory)
-            i, f, g, o = jnp.split(x + h @ kernel, 4, axis=-1)
+        def cell(
+            c: Float[Array, "E H"], h: Array, x: Array, gates: Float[Array, "E G"]
+        ) -> tuple[Float[Array, "E H"], Float[Array, "E H"]]:
+            i, f, g, o = jnp.split(gates, 4, axis=-1)
             c = nn.sigmoid(f) * c + nn.sigmoid(i) * nn.tanh(g)
-            h = nn.sigmoid(o) * nn.tanh(c)
-            return (c, h), h
+            return c, nn.sigmoid(o) * nn.tanh(c)
 
-        return jax.lax.scan(step, memory, (inputs, begins))
+        return recurrent.run(cell, memory, inputs[..., :0], inputs, kernel, begins)
 
 
 class GRU(nn.Module):
@@ -118,19 +221,18 @@ class GRU(nn.Module):
         kernel = self.param("recurrent", _stacked_orthogonal, (self.hidden, 3 * self.hidden))
         bias = self.param("candidate_bias", nn.initializers.zeros, (self.hidden,))
 
-        def step(
-            h: Float[Array, "E H"], xs: tuple[Float[Array, "E G"], Bool[Array, " E"]]
-        ) -> tuple[Float[Array, "E H"], Float[Array, "E H"]]:
-            x, begin = xs
-            h = jnp.where(begin[:, None], 0.0, h)
-            x_r, x_u, x_n = jnp.split(x, 3, axis=-1)
-            h_r, h_u, h_n = jnp.split(h @ kernel, 3, axis=-1)
-            update = nn.sigmoid(x_u + h_u)
-            candidate = nn.tanh(x_n + nn.sigmoid(x_r + h_r) * (h_n + bias))
-            h = (1.0 - update) * candidate + update * h
-            return h, h
+        def cell(
+            _: None, h: Float[Array, "E H"], x_n: Float[Array, "E H"], gates: Float[Array, "E G"]
+        ) -> tuple[None, Float[Array, "E H"]]:
+            r, u, h_n = jnp.split(gates, 3, axis=-1)
+            update = nn.sigmoid(u)
+            candidate = nn.tanh(x_n + nn.sigmoid(r) * h_n)
+            return None, (1.0 - update) * candidate + update * h
 
-        return jax.lax.scan(step, memory, (inputs, begins))
+        gates, x_n = jnp.split(inputs, [2 * self.hidden], axis=-1)
+        offset = jnp.concatenate([gates, jnp.broadcast_to(bias, x_n.shape)], axis=-1)
+        (_, memory), h = recurrent.run(cell, (None, memory), x_n, offset, kernel, begins)
+        return memory, h
 
 
 def _dot_general(
@@ -138,11 +240,11 @@ def _dot_general(
 ) -> Float[Array, "*n O"]:
     """Return x W under the name and arguments by which nn.Dense asks for it."""
     del dimensions, precision
-    return _product(x, kernel)
+    return product(x, kernel)
 
 
 @jax.custom_vjp
-def _product(x: Float[Array, "*n I"], kernel: Float[Array, "I O"]) -> Float[Array, "*n O"]:
+def product(x: Float[Array, "*n I"], kernel: Float[Array, "I O"]) -> Float[Array, "*n O"]:
     """Return x W.
 
     JAX writes the gradient of W as a transposed (g' x)', and a CPU then copies g to turn it over.
@@ -165,7 +267,7 @@ def _product_backward(
     return g @ kernel.T, flat_x.T @ flat_g
 
 
-_product.defvjp(_product_forward, _product_backward)
+product.defvjp(_product_forward, _product_backward)
 
 
 def _stacked_orthogonal(

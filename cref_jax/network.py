@@ -6,16 +6,29 @@ three control steps; it is encoded once and its tokens are held. Observations ar
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, no_type_check
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float, Int
 
-from cref_jax import config
-from cref_jax.layers import GRU, LSTM, MLP, Convolution, dense
+from cref_jax import config, patches
+from cref_jax.holding import Holding, by_frame, by_step, holding, repeated
+from cref_jax.layers import (
+    GRU,
+    LSTM,
+    MLP,
+    Convolution,
+    LayerNorm,
+    PatchFilter,
+    dense,
+    elu,
+    product,
+)
 
+_BLOCK = 8  # pixels, side of the blocks of the depth compression
 _HEAD_SCALE = 0.01  # of the last layer of the action head; assumed: the first actions are near zero
 
 
@@ -27,12 +40,16 @@ class Carry(NamedTuple):
     gru: Float[Array, "E H_gru"]
 
 
-class Sight(NamedTuple):
+@no_type_check  # tree.map fills it with what is no array
+@flax.struct.dataclass
+class Sight:
     """What the camera showed during T control steps: K frames, each held for some steps."""
 
-    frames: Float[Array, "K E H W"]  # D, normalised depth
+    frames: Float[Array, "K E rows columns pixels"]  # D, normalised depth, see `in_patches`
     held: Int[Array, "T E"]  # the frame at hand; one camera clock, so the same for all robots
     seen: Bool[Array, "T E"]  # False until the first frame of an episode has come
+    hold: int | None = flax.struct.field(pytree_node=False, default=None)
+    # steps that a frame is held for at most; when left out any number
 
 
 class Features(NamedTuple):
@@ -42,12 +59,21 @@ class Features(NamedTuple):
     compressed: Float[Array, "K E C"]  # C_psi(D), Eq. 7
 
 
-class View(NamedTuple):
+@no_type_check
+@flax.struct.dataclass
+class View:
     """The same with the frames encoded."""
 
     features: Features
     held: Int[Array, "T E"]
     seen: Bool[Array, "T E"]
+    hold: int | None = flax.struct.field(pytree_node=False, default=None)
+
+    @property
+    def holding(self) -> Holding:
+        """Where each step is among those that hold its frame."""
+        steps, frames = self.held.shape[0], self.features.tokens.shape[0]
+        return holding(self.held[:, 0], frames, min(self.hold or steps, steps))
 
 
 class Output(NamedTuple):
@@ -80,6 +106,20 @@ def no_features(c: config.Network, image: tuple[int, int], num_envs: int) -> Fea
     )
 
 
+def in_patches(c: config.Network, image: Float[Array, "*n H W"]) -> Float[Array, "*n r c pixels"]:
+    """Return depth images in the order in which the depth tokenizer reads them."""
+    return patches.to_patches(image[..., None], _strides(c))[..., 0]
+
+
+def as_image(c: config.Network, frame: Float[Array, "*n r c pixels"]) -> Float[Array, "*n H W"]:
+    """Return what `in_patches` was given."""
+    return patches.to_image(frame[..., None], _strides(c))[..., 0]
+
+
+def _strides(c: config.Network) -> tuple[int, ...]:
+    return tuple(stride for _, _, stride in c.convolutions)
+
+
 class Actor(nn.Module):
     """The policy: proprioception and depth to the action distribution.
 
@@ -95,7 +135,7 @@ class Actor(nn.Module):
         c = self.c
         if c.variant != "blind":
             self.depth_tokenizer = DepthTokenizer(c)
-            self.depth_compression = DepthCompression(c.compressed)
+            self.depth_compression = DepthCompression(c)
             attends = c.variant != "no_cross_attention"
             self.depth_query = (
                 CrossAttention(c.heads, name="cross_attention")
@@ -126,10 +166,10 @@ class Actor(nn.Module):
             begins: the step is the first of an episode, so the memory is emptied before it.
             sight: the frames, each of which is encoded once; a blind policy has none.
         """
-        view = sight and View(self.encode(sight.frames), sight.held, sight.seen)
+        view = sight and View(self.encode(sight.frames), sight.held, sight.seen, sight.hold)
         return self.decide(carry, obs, begins, view)
 
-    def encode(self, frames: Float[Array, "K E H W"]) -> Features:
+    def encode(self, frames: Float[Array, "K E rows columns pixels"]) -> Features:
         """Return what depends on the frames alone."""
         frames = frames.astype(jnp.float32)
         return Features(self.depth_tokenizer(frames), self.depth_compression(frames))
@@ -147,18 +187,17 @@ class Actor(nn.Module):
         """
         if (view is None) != (self.c.variant == "blind"):
             raise ValueError(f"frames are for every variant but 'blind', not for {self.c.variant}")
-        inputs, tokens = obs, None
+        inputs = obs
         if view is not None:
-            at_hand = jax.tree.map(lambda x: x[view.held[:, 0]], view.features)
-            tokens, seen = at_hand.tokens, view.seen[..., None]
-            compressed = jnp.where(seen, at_hand.compressed, 0.0)
+            at_hand, seen = view.holding, view.seen[..., None]
+            compressed = jnp.where(seen, repeated(view.features.compressed, at_hand), 0.0)
             inputs = jnp.concatenate([obs, compressed], axis=-1)
         lstm, velocity = self.velocity_estimator((carry.lstm_c, carry.lstm_h), inputs, begins)
         known = jnp.concatenate([obs, jax.lax.stop_gradient(velocity)], axis=-1)
         x = self.proprioceptive_tokenizer(known)
         attention = None
-        if tokens is not None:
-            found, attention = self.depth_query(x, tokens)
+        if view is not None:
+            found, attention = self.depth_query(x, view.features.tokens, at_hand)
             x = jnp.concatenate([x, jnp.where(seen, found, 0.0)], axis=-1)
         f = self.fusion(x)
         gru, y, gate = self.recurrent_fusion(carry.gru, f, begins)
@@ -183,15 +222,24 @@ class DepthTokenizer(nn.Module):
     c: config.Network
 
     @nn.compact
-    def __call__(self, frames: Float[Array, "K E H W"]) -> Float[Array, "K E N D"]:
+    def __call__(self, frames: Float[Array, "K E rows columns pixels"]) -> Float[Array, "K E N D"]:
         """Return the tokens, row by row from the top left of the image."""
-        x = frames[..., None]
+        x, strides = frames[..., None], _strides(self.c)
         for i, (channels, kernel, stride) in enumerate(self.c.convolutions):
-            x = nn.elu(Convolution(channels, kernel, stride, name=f"layer_{i}")(x))
+            after = strides[i + 1 :]
+            if kernel == stride:
+                group = after[0] ** 2 if after else 1
+                layer = PatchFilter(channels, group, name=f"layer_{i}")
+                y = layer(x.reshape(-1, stride * stride * x.shape[-1]))
+                x = elu(y).reshape(*x.shape[:4], -1, channels)
+            else:
+                image = patches.to_image(x, strides[i:])
+                image = elu(Convolution(channels, kernel, stride, name=f"layer_{i}")(image))
+                x = patches.to_patches(image, after)
         x = dense(self.c.token, name="projection")(x.reshape(*x.shape[:2], -1, x.shape[-1]))
         # assumed: attention has no order, so each token learns where it is
         place = self.param("place", nn.initializers.normal(0.02), x.shape[2:])
-        return nn.LayerNorm(name="norm")(x + place)
+        return LayerNorm(name="norm")(x + place)
 
 
 class DepthCompression(nn.Module):
@@ -200,14 +248,17 @@ class DepthCompression(nn.Module):
     assumed: the means of blocks of 8 x 8 pixels, then one layer.
     """
 
-    width: int
+    c: config.Network
 
     @nn.compact
-    def __call__(self, frames: Float[Array, "K E H W"]) -> Float[Array, "K E C"]:
+    def __call__(self, frames: Float[Array, "K E rows columns pixels"]) -> Float[Array, "K E C"]:
         """Return the compressed frames."""
-        k, e, h, w = frames.shape
-        blocks = frames.reshape(k, e, h // 8, 8, w // 8, 8).mean(axis=(3, 5))
-        return nn.elu(dense(self.width, name="layer_0")(blocks.reshape(k, e, -1)))
+        strides = _strides(self.c)
+        if math.prod(strides) != _BLOCK:
+            image = patches.to_image(frames[..., None], strides)
+            frames = patches.to_patches(image, (_BLOCK,))[..., 0]
+        means = frames.mean(axis=-1).reshape(*frames.shape[:2], -1)
+        return elu(dense(self.c.compressed, name="layer_0")(means))
 
 
 class CrossAttention(nn.Module):
@@ -216,28 +267,39 @@ class CrossAttention(nn.Module):
         Q = LN(e^p) W_q,  K = E^d W_k,  V = E^d W_v,  e^d = MHA(Q, K, V)
 
     K and V are never formed: q . (E W_k) = (q W_k') . E and w (E W_v) = (w E) W_v, head by head, so
-    one query costs a tenth of what the projections of 48 tokens would.
+    one query costs a tenth of what the projections of 48 tokens would. All steps that hold a frame
+    ask it at once.
     """
 
     heads: int
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "T E D"], tokens: Float[Array, "T E N D"]
+        self, x: Float[Array, "T E D"], tokens: Float[Array, "K E N D"], at_hand: Holding
     ) -> tuple[Float[Array, "T E D"], Float[Array, "T E heads N"]]:
         """Return the attention's output e^d and its weights."""
-        *lead, width = x.shape
-        each = width // self.heads
+        width, (frames, robots, count, _) = x.shape[-1], tokens.shape
         init = nn.initializers.lecun_normal()
-        key = self.param("key", init, (width, width)).reshape(width, self.heads, each)
-        value = self.param("value", init, (width, width)).reshape(width, self.heads, each)
-        query = dense(width, use_bias=False, name="query")(nn.LayerNorm(name="norm")(x))
-        asked = jnp.einsum("tehk,dhk->tehd", query.reshape(*lead, self.heads, each), key)
-        scores = jnp.einsum("tehd,tend->tehn", asked, tokens) / math.sqrt(each)
+        key = _each_head(self.param("key", init, (width, width)), self.heads).T
+        value = _each_head(self.param("value", init, (width, width)), self.heads)
+        query = dense(width, use_bias=False, name="query")(LayerNorm(name="norm")(x))
+        asked = product(by_frame(query, at_hand), key).reshape(frames, robots, -1, width)
+        scores = jnp.einsum("kesd,kend->kesn", asked, tokens) / math.sqrt(width // self.heads)
         weights = nn.softmax(scores)
-        mixed = jnp.einsum("tehn,tend->tehd", weights, tokens)
-        found = jnp.einsum("tehd,dhk->tehk", mixed, value).reshape(*lead, width)
-        return dense(width, use_bias=False, name="output")(found), weights
+        mixed = jnp.einsum("kesn,kend->kesd", weights, tokens)
+        mixed = mixed.reshape(frames, robots, -1, self.heads * width)
+        found = by_step(product(mixed, value), at_hand)
+        weights = by_step(weights.reshape(frames, robots, -1, self.heads * count), at_hand)
+        shown = weights.reshape(*x.shape[:2], self.heads, count)
+        return dense(width, use_bias=False, name="output")(found), shown
+
+
+def _each_head(kernel: Float[Array, "D hd"], heads: int) -> Float[Array, "hD hd"]:
+    """Return the matrix that takes each head's D inputs to its own outputs, and no other's."""
+    width = kernel.shape[0]
+    of_head = kernel.reshape(width, heads, -1)
+    apart = jnp.eye(heads)[:, None, :, None] * of_head[None]
+    return apart.reshape(heads * width, -1)
 
 
 class PooledTokens(nn.Module):
@@ -245,10 +307,11 @@ class PooledTokens(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "T E D"], tokens: Float[Array, "T E N D"]
+        self, x: Float[Array, "T E D"], tokens: Float[Array, "K E N D"], at_hand: Holding
     ) -> tuple[Float[Array, "T E D"], None]:
         """Return the projected mean, and no weights."""
-        return dense(x.shape[-1], name="projection")(tokens.mean(axis=2)), None
+        pooled = dense(x.shape[-1], name="projection")(tokens.mean(axis=2))
+        return repeated(pooled, at_hand), None
 
 
 class VelocityEstimator(nn.Module):
@@ -282,7 +345,7 @@ class GatedResidualFusion(nn.Module):
     def __call__(self, x: Float[Array, "T E D"]) -> Float[Array, "T E D"]:
         """Return f."""
         width = x.shape[-1]
-        mixed = nn.elu(dense(width, name="mix")(nn.LayerNorm(name="norm")(x)))
+        mixed = elu(dense(width, name="mix")(LayerNorm(name="norm")(x)))
         if not self.gated:
             return x + dense(width, name="content")(mixed)
         content, gate = jnp.split(dense(2 * width, name="content_gate")(mixed), 2, axis=-1)

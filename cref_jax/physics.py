@@ -69,6 +69,7 @@ class Physics:
         spec = robot.spec(robot.moving(robot_config), physics_config)
         if engine == "mujoco":
             robot.add_force_sensors(spec)
+            robot.solve_sparsely(spec)
         self.model = spec.compile()
         self.tree = kinematics.tree(self.model)
         self.engine: Engine = (

@@ -209,7 +209,7 @@ def _advance(
     memory, action, mind = robots.memory, jnp.zeros((1, joints)), None
     if train is not None:
         memory, policy = rollout.act(rollout.networks(c, joints), train, robots)
-        action, mind = policy.mean[0], _mind(robots, policy)
+        action, mind = policy.mean[0], _mind(c, robots, policy)
     elif agent == "random":
         action = c.initial_std * jax.random.normal(key, action.shape)
     after, outcome = rollout.advance(world, robots, memory, action)
@@ -224,12 +224,12 @@ def _advance(
     return after, step
 
 
-def _mind(robots: rollout.Robots, policy: network.Output) -> Minds:
+def _mind(c: config.Network, robots: rollout.Robots, policy: network.Output) -> Minds:
     """Return what the first robot's policy sees and does."""
     feed, weights = robots.feed, policy.attention
     return Minds(
         gate=policy.gate[0, 0],
-        depth=None if feed is None else feed.frame[0].astype(jnp.float32),
+        depth=None if feed is None else feed.images(c)[0].astype(jnp.float32),
         seen=jnp.zeros((), bool) if feed is None else feed.seen[0],
         attention=None if weights is None else weights[0, 0].mean(axis=0),
     )

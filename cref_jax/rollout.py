@@ -26,10 +26,14 @@ from cref_jax.world import World
 class Feed:
     """What the cameras have delivered."""
 
-    frame: Float16[Array, "E H W"]  # D, the last one that came
+    frame: Float16[Array, "E rows columns pixels"]  # D, the last that came, see network.in_patches
     seen: Bool[Array, " E"]  # it is of this episode
     fresh: Bool[Array, ""]  # it came in the last step
     clock: Int[Array, ""]  # control steps since the cameras were started
+
+    def images(self, c: config.Network) -> Float16[Array, "E H W"]:
+        """Return the frames as images."""
+        return network.as_image(c, self.frame)
 
 
 class Memory(NamedTuple):
@@ -150,7 +154,7 @@ def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
             network.no_features(c.network, c.camera.shape, num_envs) if sees else None,
         ),
         begins=jnp.ones(num_envs, bool),
-        feed=_first_feed(c.camera, num_envs) if sees else None,
+        feed=_first_feed(c, num_envs) if sees else None,
     )
 
 
@@ -182,8 +186,8 @@ def advance(
     return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome
 
 
-def exposed(world: World, state: EnvState) -> Float16[Array, "E H W"]:
-    """Return what all cameras see.
+def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pixels"]:
+    """Return what all cameras see, in the order in which the network reads it.
 
     `start` puts the robots on the kinds of lane in turn, for good: so it is known beforehand which
     of them stand on lanes that are level across, and these images cost an eighth.
@@ -198,7 +202,13 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E H W"]:
             part = jax.tree.map(lambda x, some=some: x[some], state)
             images.append(jax.vmap(look, in_axes=(None, 0))(world, part).astype(jnp.float16))
             robots.append(some)
-    return jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
+    # always, but XLA does not know: it stores what a choice gives. Else it would render each pixel
+    # where it is put in order below, one by one
+    images = jax.lax.cond(
+        state.step[0] >= 0, lambda: images, lambda: jax.tree.map(jnp.zeros_like, images)
+    )
+    image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
+    return network.in_patches(world.config.network, image)
 
 
 def collect(
@@ -233,7 +243,7 @@ def collect(
     if after.feed is not None:
         blank = jax.tree.map(jnp.zeros_like, after.memory.features)
         after = after.replace(memory=after.memory._replace(features=blank))
-    rollout = _rollout(nets, train, first.memory.carry, watch.album, steps)
+    rollout = _rollout(c, nets, train, first.memory.carry, watch.album, steps)
     outcome = steps.outcome
     return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
 
@@ -244,7 +254,7 @@ class _Watch:
     """The robots during a horizon, and the frames that have come so far."""
 
     robots: Robots
-    album: Float16[Array, "K E H W"] | None
+    album: Float16[Array, "K E rows columns pixels"] | None
     held: Int[Array, ""]  # where the frame at hand is in the album
 
 
@@ -264,15 +274,17 @@ def _filed(watch: _Watch) -> _Watch:
     if feed is None or watch.album is None:
         return watch
     held = watch.held + feed.fresh.astype(jnp.int32)
-    album = watch.album.at[held].set(feed.frame, mode="drop")
+    add = lambda: watch.album.at[held].set(feed.frame, mode="drop")
+    album = jax.lax.cond(feed.fresh, add, lambda: watch.album)
     return watch.replace(album=album, held=held)
 
 
 def _rollout(
+    c: config.Config,
     nets: Networks,
     train: ppo.TrainState,
     carry: network.Carry,
-    album: Float16[Array, "K E H W"] | None,
+    album: Float16[Array, "K E rows columns pixels"] | None,
     steps: _Step,
 ) -> ppo.Rollout:
     """Return a horizon's steps as the update takes them."""
@@ -282,7 +294,8 @@ def _rollout(
     outcome, sight = steps.outcome, None
     if album is not None and steps.seen is not None:
         held = jnp.broadcast_to(steps.held[:, None], steps.seen.shape)
-        sight = network.Sight(album, held, steps.seen)
+        hold = depth.longest_hold(c.camera, c.physics.control_period)
+        sight = network.Sight(album, held, steps.seen, hold)
     return ppo.Rollout(
         obs=steps.observation.proprioception,
         critic_obs=steps.observation.privileged,
@@ -302,10 +315,11 @@ def _rollout(
     )
 
 
-def _first_feed(c: config.Camera, num_envs: int) -> Feed:
+def _first_feed(c: config.Config, num_envs: int) -> Feed:
     """Return the state of cameras that have delivered nothing."""
+    blank = jnp.zeros((num_envs, *c.camera.shape), jnp.float16)  # 16 bits: to 0.4 mm at 3 m
     return Feed(
-        frame=jnp.zeros((num_envs, *c.shape), jnp.float16),  # 16 bits: to 0.4 mm at 3 m
+        frame=network.in_patches(c.network, blank),
         seen=jnp.zeros(num_envs, bool),
         fresh=jnp.zeros((), bool),
         clock=jnp.zeros((), jnp.int32),

@@ -84,7 +84,7 @@ def record(world: World, train: ppo.TrainState, steps: int, key: Array) -> Recor
             q=part["joint_position"] + nominal,
             qd=part["joint_velocity"],
             reset=robots.begins[0],
-            image=None if feed is None else feed.frame[0],
+            image=None if feed is None else feed.images(world.config.network)[0],
             fresh=jnp.zeros((), bool) if feed is None else feed.fresh & feed.seen[0],
         )
 
@@ -131,8 +131,8 @@ def _said(
     obs = ppo.normalise(train.statistics.obs, obs)
     view, features, seen = None, held.features, held.seen & ~begins | step.fresh
     if features is not None:
-        image = jnp.asarray(step.image)[None, None]
-        encode = lambda: actor.apply(params, image, method="encode")
+        frame = network.in_patches(actor.c, jnp.asarray(step.image)[None, None])
+        encode = lambda: actor.apply(params, frame, method="encode")
         emptied = jax.tree.map(lambda x: jnp.where(begins[0], 0.0, x), features)
         features = jax.lax.cond(step.fresh, encode, lambda: emptied)
         view = network.View(features, jnp.zeros((1, 1), jnp.int32), seen[None])

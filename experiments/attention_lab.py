@@ -158,11 +158,12 @@ def check(c: Config) -> None:
 def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
     """Return the frame that is exposed, what is in it, and the attention to the one before."""
     state, feed = moment.robots.env, moment.after.feed
+    images = feed.images(world.config.network)
     shape = gaze.grid(world.config)
 
     def targets() -> tuple[Bool[Array, "E N"], Bool[Array, "E N"]]:
         camera = world.config.camera
-        metres = (feed.frame.astype(jnp.float32) + 0.5) * camera.d_max
+        metres = (images.astype(jnp.float32) + 0.5) * camera.d_max
         ground = jax.vmap(lambda s: gaze.ground_alone(world, s))(state)
         own = metres < ground - gaze.LINK
         edge = gaze.is_edge(ground, camera) & ~own
@@ -175,7 +176,7 @@ def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
         base_x=state.body.qpos[:, 0],
         edge=edge,
         own=own,
-        frame=feed.frame[np.array(followed)],
+        frame=images[np.array(followed)],
         attention=moment.policy.attention[0],
     )
 

@@ -28,7 +28,9 @@ def policy(variant: config.Variant, net: config.Network = SMALL) -> runs.Policy:
     sight = None
     if variant != "blind":
         zero = jnp.zeros((1, 1), jnp.int32)
-        sight = network.Sight(jnp.zeros((1, 1, *c.camera.shape)), zero, zero > 0)
+        sight = network.Sight(
+            network.in_patches(c.network, jnp.zeros((1, 1, *c.camera.shape))), zero, zero > 0
+        )
     key = jax.random.key(3)
     begins = jnp.zeros((1, 1), bool)
     params = jax.jit(actor.init)(key, carry, jnp.zeros((1, 1, OBS)), begins, sight)

@@ -12,8 +12,8 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "layers"},
-    {"paper", "proportion", "stall", "disturbance", "processes"},
+    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "recurrent"},
+    {"paper", "proportion", "stall", "disturbance", "processes", "layers", "patches", "holding"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
     {"physics", "depth", "foothold", "evaluation_page"},

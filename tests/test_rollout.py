@@ -92,8 +92,9 @@ def test_a_frame_shows_the_robot_one_control_step_before(seeing):
         assert bool(after.feed.fresh) == bool(
             depth.is_due(after.feed.clock, config.Camera(), period)
         )
-        shown = expose(world, state.env) if after.feed.fresh else state.feed.frame
-        np.testing.assert_allclose(after.feed.frame, shown, atol=3e-4)  # half a unit of 16 bits
+        images = lambda robots: robots.feed.images(world.config.network)
+        shown = expose(world, state.env) if after.feed.fresh else images(state)
+        np.testing.assert_allclose(images(after), shown, atol=3e-4)  # half a unit of 16 bits
         came += int(after.feed.fresh)
         state = after
     assert came == 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from cref_jax import config, layers, network
+from cref_jax import config, holding, layers, network
 
 T, E, K, OBS, J = 6, 3, 3, 7, 2
 TOKENS = 48
@@ -18,7 +18,8 @@ VARIANTS = ("full", "no_cross_attention", "no_grf", "no_highway")
 
 
 def some_sight(held=HELD, seed=5):
-    frames = jax.random.uniform(jax.random.key(seed), (K, E, 48, 64), minval=-0.5, maxval=0.5)
+    images = jax.random.uniform(jax.random.key(seed), (K, E, 48, 64), minval=-0.5, maxval=0.5)
+    frames = network.in_patches(C, images)
     seen = jnp.ones((len(held), E), bool).at[:2, 1].set(False)
     return network.Sight(frames, jnp.broadcast_to(held[:, None], (len(held), E)), seen)
 
@@ -55,7 +56,7 @@ run = jax.jit(actor().apply)
 
 def test_held_frames_give_the_actions_and_gradients_of_a_frame_at_every_step(params, obs):
     cached = some_sight()
-    every = cached._replace(
+    every = cached.replace(
         frames=cached.frames[HELD], held=jnp.broadcast_to(jnp.arange(T)[:, None], (T, E))
     )
 
@@ -87,17 +88,17 @@ def test_stepping_with_cached_features_agrees_with_the_whole_sequence(params, ob
 
 def test_a_frame_that_has_not_been_seen_changes_nothing(params, obs):
     sight = some_sight()
-    other = sight._replace(frames=sight.frames.at[0, 1].set(0.3))  # held while robot 1 sees nothing
+    other = sight.replace(frames=sight.frames.at[0, 1].set(0.3))  # held while robot 1 sees nothing
     _, out = run(params, START, obs, NEVER, sight)
     _, same = run(params, START, obs, NEVER, other)
     np.testing.assert_array_equal(out.mean, same.mean)
-    _, seen = run(params, START, obs, NEVER, other._replace(seen=jnp.ones((T, E), bool)))
+    _, seen = run(params, START, obs, NEVER, other.replace(seen=jnp.ones((T, E), bool)))
     assert np.abs(seen.mean[0, 1] - out.mean[0, 1]).max() > 1e-4
 
 
 def test_a_robot_sees_its_own_frames_alone(params, obs):
     def one(frames):
-        _, out = run(params, START, obs, NEVER, some_sight()._replace(frames=frames))
+        _, out = run(params, START, obs, NEVER, some_sight().replace(frames=frames))
         return jnp.sum(out.mean[:, 1] ** 2)
 
     reach = jax.jit(jax.grad(one))(some_sight().frames)
@@ -109,8 +110,9 @@ def test_attention_agrees_with_projected_keys_and_values():
     x = jax.random.normal(jax.random.key(0), (T, E, 8))
     tokens = jax.random.normal(jax.random.key(1), (T, E, TOKENS, 8))
     module = network.CrossAttention(heads=2)
-    params = jax.jit(module.init)(jax.random.key(2), x, tokens)
-    found, weights = jax.jit(module.apply)(params, x, tokens)
+    every = holding.holding(jnp.arange(T), T, 1)
+    params = jax.jit(module.init)(jax.random.key(2), x, tokens, every)
+    found, weights = jax.jit(module.apply)(params, x, tokens, every)
 
     p = params["params"]
     query = nn.LayerNorm().apply({"params": p["norm"]}, x) @ p["query"]["kernel"]
@@ -136,7 +138,10 @@ def test_attention_finds_the_token_that_answers_the_query():
     }
     tokens = jnp.zeros((1, 1, TOKENS, 2)).at[0, 0, 3].set(jnp.array([50.0, -50.0]))
     found, weights = network.CrossAttention(heads=1).apply(
-        {"params": params}, jnp.array([[[1.0, -1.0]]]), tokens
+        {"params": params},
+        jnp.array([[[1.0, -1.0]]]),
+        tokens,
+        holding.holding(jnp.zeros(1, int), 1, 1),
     )
     assert int(weights[0, 0, 0].argmax()) == 3
     np.testing.assert_allclose(weights[0, 0, 0, 3], 1.0, atol=1e-6)
@@ -163,9 +168,10 @@ def test_convolution_agrees_with_xla(kernel, stride):
 def test_tokens_are_local_and_in_the_order_of_the_image():
     frames = jnp.zeros((1, 1, 48, 64))
     tokenizer = network.DepthTokenizer(C)
-    params = jax.jit(tokenizer.init)(jax.random.key(0), frames)
-    flat = jax.jit(tokenizer.apply)(params, frames)
-    spot = jax.jit(tokenizer.apply)(params, frames.at[0, 0, 16:20, 32:36].set(1.0))
+    tokens = jax.jit(lambda p, images: tokenizer.apply(p, network.in_patches(C, images)))
+    params = jax.jit(tokenizer.init)(jax.random.key(0), network.in_patches(C, frames))
+    flat = tokens(params, frames)
+    spot = tokens(params, frames.at[0, 0, 16:20, 32:36].set(1.0))
     moved = np.flatnonzero(np.abs(spot - flat)[0, 0].max(axis=-1) > 1e-6)
     # 4 x 4 pixels to a patch: the spot is patch (4, 8). Token (r, c) looks at 3 x 3 patches from
     # (2 r, 2 c) on, so rows 1 and 2 and columns 3 and 4 see it: tokens 8 r + c
@@ -174,7 +180,8 @@ def test_tokens_are_local_and_in_the_order_of_the_image():
 
 def test_compression_is_a_layer_on_the_means_of_blocks():
     frames = jnp.zeros((1, 1, 48, 64)).at[0, 0, 8:16, 16:24].set(0.5)  # block row 1, column 2
-    module = network.DepthCompression(3)
+    c = config.override(C, {"compressed": 3})
+    module, frames = network.DepthCompression(c), network.in_patches(c, frames)
     params = jax.jit(module.init)(jax.random.key(0), frames)
     kernel = params["params"]["layer_0"]["kernel"]
     expected = nn.elu(0.5 * kernel[1 * 8 + 2])
