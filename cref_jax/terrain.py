@@ -55,7 +55,7 @@ def from_heights(
     given it is one tile.
     """
     heights = jnp.asarray(heights, jnp.float32)
-    lane = lane or heights.shape
+    lane = lane or (heights.shape[0], heights.shape[1])
     if heights.shape[0] % lane[0] or heights.shape[1] % lane[1]:
         raise ValueError(f"{heights.shape} columns are not whole tiles of {lane}")
     larger = [_blocks(heights, lane, side).max((2, 5)) for side in BLOCKS[1:]]
