@@ -6,19 +6,17 @@ camera's x right, y down, z forward; pixel (0, 0) is at the top left.
 
 import math
 from fractions import Fraction
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from cref_jax import config, geometry, kinematics, robot, terrain
+from cref_jax import config, geometry, kinematics, march, robot, terrain
 from cref_jax.kinematics import Links
-from cref_jax.terrain import BLOCKS, Terrain, block_top
+from cref_jax.terrain import Terrain
 
-_LEVEL = 3  # mask of the bits of a march's state that hold the level of BLOCKS
-_ALONG = 1e-6  # columns/m, no ray is more nearly parallel to a border of columns
+_ALONG = 1e-6  # columns/m, no ray is more nearly parallel to the border of a column
 _PARALLEL = 1e-9  # no ray is more nearly parallel to a capsule: sine squared of their angle
 
 
@@ -37,16 +35,15 @@ def render(
     ground reads 0; a capsule that the camera is inside of is not seen.
 
     `is_profile` promises that heights are the same all across (along y), as on stairs: the image is
-    the same, and comes eight times as fast.
+    the same, and comes sooner.
     """
     height, width = camera.shape
-    x, y = _slopes(width, camera.view[1]), _slopes(height, camera.view[0])
+    x, y = _slopes(width, camera.view[1])[None, :], _slopes(height, camera.view[0])[:, None]
     if is_profile:
-        ground = _sweep(terrain, position, rotation, x[None, :], y[:, None], camera)
+        ground = _sweep(terrain, position, rotation, x, y, camera)
     else:
-        eye = _eye(terrain, position, rotation, camera)
-        ground = jax.vmap(lambda y: _march(terrain, eye, x, y, camera))(y)
-    links = _links(position, rotation, capsules, x[None, :], y[:, None])
+        ground = march.ground_depth(terrain, position, rotation, x, y, camera)
+    links = _links(position, rotation, capsules, x, y)
     return jnp.minimum(jnp.minimum(ground, links), camera.d_max)
 
 
@@ -109,33 +106,6 @@ def longest_hold(camera: config.Camera, control_period: float) -> int:
     return -(-steps // frames)
 
 
-class _Eye(NamedTuple):
-    """Where a camera is on the grid. Scalars: XLA then makes one loop over all rays of all cameras.
-
-    Columns are counted from the corner of the largest block that the camera stands on: numbers
-    stay small, so float32 stays exact, and blocks begin at multiples of their side.
-    """
-
-    i: Int[Array, ""]  # column of the window in that corner
-    j: Int[Array, ""]
-    x: Float[Array, ""]  # columns
-    y: Float[Array, ""]
-    z: Float[Array, ""]  # m
-    axes: Float[Array, "3 3"]  # columns/m, columns/m, 1: the world's x, y, z of the camera's axes
-    nudge: float  # columns, further along the ray is the column that a point on a border belongs to
-
-
-class _Ray(NamedTuple):
-    """A direction, for one unit of depth, and the inverses that divide by it."""
-
-    x: Float[Array, " W"]  # columns/m
-    y: Float[Array, " W"]
-    z: Float[Array, " W"]  # m/m
-    per_x: Float[Array, " W"]  # m/column
-    per_y: Float[Array, " W"]
-    per_z: Float[Array, " W"]  # m/m; 0 for a ray that does not go down
-
-
 def _frames(camera: config.Camera, control_period: float) -> tuple[int, int]:
     """Return how many frames arrive in how many control steps; never more than one a step."""
     ratio = min(Fraction(camera.rate * control_period).limit_denominator(10_000), Fraction(1))
@@ -146,29 +116,6 @@ def _slopes(pixels: int, view: float) -> Float[np.ndarray, " n"]:
     """Return the tangents of the pixels' angles from the optical axis, `view` in deg."""
     middles = 2.0 * (np.arange(pixels) + 0.5) / pixels - 1.0
     return (middles * math.tan(math.radians(0.5 * view))).astype(np.float32)
-
-
-def _eye(
-    ground: Terrain,
-    position: Float[Array, "3"],
-    rotation: Float[Array, "3 3"],
-    camera: config.Camera,
-) -> _Eye:
-    """Return a camera in columns."""
-    place = (position[:2] - ground.origin) * (1.0 / ground.cell)
-    column = jnp.floor(place)
-    inside = (ground.first + column.astype(jnp.int32)) & (BLOCKS[-1] - 1)
-    corner = column.astype(jnp.int32) - inside
-    x, y = place - column + inside.astype(jnp.float32)
-    scale = jnp.array([[1.0 / ground.cell], [1.0 / ground.cell], [1.0]])
-    nudge = 1.2e-6 * (_reach(ground, camera) + BLOCKS[-1])  # ten times the rounding of a float
-    return _Eye(corner[0], corner[1], x, y, position[2], rotation * scale, nudge)
-
-
-def _reach(ground: Terrain, camera: config.Camera) -> float:
-    """Return the number of columns in the longest ray."""
-    corner = [math.tan(math.radians(0.5 * view)) for view in camera.view]
-    return camera.d_max * math.hypot(1.0, *corner) / ground.cell
 
 
 def _sweep(
@@ -192,7 +139,7 @@ def _sweep(
 
     place = (position[0] - ground.origin[0]) * (1.0 / ground.cell)
     own = jnp.floor(place)
-    ahead = jnp.array([1.0, -1.0])[:, None] * np.arange(int(_reach(ground, camera)) + 2.0)
+    ahead = jnp.array([1.0, -1.0])[:, None] * np.arange(int(march.ray_reach(ground, camera)) + 2.0)
     middle = ground.origin[0] + (own + ahead + 0.5) * ground.cell
     across = jnp.broadcast_to(position[1], middle.shape)
     rise = terrain.height_at(ground, jnp.stack([middle, across], axis=-1)) - position[2]
@@ -218,95 +165,6 @@ def _sweep(
     depth = jnp.maximum(of_ray(near), top) * per_x
     seen = (column < count) & (depth < camera.d_max)  # not NaN, either
     return jnp.where(seen, depth, camera.d_max)
-
-
-def _march(
-    ground: Terrain,
-    eye: _Eye,
-    x: Float[np.ndarray, " W"],
-    y: Float[Array, ""],
-    camera: config.Camera,
-) -> Float[Array, " W"]:
-    """Return the depth of the ground along one row of rays, m, or d_max where there is none."""
-    state = jnp.full(x.shape, len(BLOCKS) - 1, jnp.int32)
-    # a ray crosses two borders a column at most, and may go down through all levels before each
-    most = int(2 * len(BLOCKS) * (_reach(ground, camera) + 2))
-    farthest = int(np.float32(camera.d_max).view(np.int32))
-
-    def is_short(carry: tuple) -> Bool[Array, ""]:
-        count, _, state = carry  # a state below zero is large without its sign
-        return (count < most) & jnp.any(state.astype(jnp.uint32) < farthest)
-
-    def advance(carry: tuple) -> tuple:
-        count, axes, state = carry
-        following = _advance(ground, eye, _ray(eye._replace(axes=axes), x, y), state)
-        # as if the axes changed: or XLA would store all rays, and reading them takes longer
-        return count + 1, jnp.where(count < most, axes, 0.0), following
-
-    _, _, state = jax.lax.while_loop(is_short, advance, (0, eye.axes, state))
-    depth = -jax.lax.bitcast_convert_type(state, jnp.float32)
-    return jnp.where((state < 0) & (depth < camera.d_max), depth, camera.d_max)  # not NaN, either
-
-
-def _ray(eye: _Eye, x: Float[np.ndarray, " W"], y: Float[Array, ""]) -> _Ray:
-    """Return the rays of a row of pixels."""
-    to_x, to_y, to_z = (row[0] * x + row[1] * y + row[2] for row in eye.axes)
-    to_x = jnp.where(jnp.abs(to_x) < _ALONG, _ALONG, to_x)
-    to_y = jnp.where(jnp.abs(to_y) < _ALONG, _ALONG, to_y)
-    down = jnp.where(to_z < 0.0, 1.0 / to_z, 0.0)
-    return _Ray(to_x, to_y, to_z, 1.0 / to_x, 1.0 / to_y, down)
-
-
-def _advance(ground: Terrain, eye: _Eye, ray: _Ray, state: Int[Array, " W"]) -> Int[Array, " W"]:
-    """Return the state of each ray one block further, or one level down, or at the ground.
-
-    The state is a depth and the level of BLOCKS to look at there, in one number: XLA makes a loop
-    for each result and would do everything twice for two. It stays as it is once it is negative:
-    then the depth is that of the ground.
-    """
-    depth, level = _depth(state), state & _LEVEL
-    east, north = ray.x > 0.0, ray.y > 0.0
-    i = jnp.floor(depth * ray.x + jnp.where(east, eye.x + eye.nudge, eye.x - eye.nudge))
-    j = jnp.floor(depth * ray.y + jnp.where(north, eye.y + eye.nudge, eye.y - eye.nudge))
-    i, j = i.astype(jnp.int32), j.astype(jnp.int32)
-    top, is_level = block_top(ground, level, eye.i + i, eye.j + j)
-
-    side = _of_level(level, BLOCKS)
-    border_x = (i & -side) + jnp.where(east, side, 0)
-    border_y = (j & -side) + jnp.where(north, side, 0)
-    depth_x = (border_x.astype(jnp.float32) - eye.x) * ray.per_x
-    depth_y = (border_y.astype(jnp.float32) - eye.y) * ray.per_y
-    out = jnp.minimum(depth_x, depth_y)
-    lowest = eye.z + ray.z * jnp.where(ray.z < 0.0, out, depth)
-
-    border = jnp.where(depth_x <= depth_y, border_x, border_y)
-    after = jnp.zeros_like(level)  # the level of the largest block that begins at this border
-    for k, larger in enumerate(BLOCKS):
-        after = jnp.where(border & (larger - 1) == 0, k, after)
-    hit = jnp.maximum(depth, (top - eye.z) * ray.per_z)  # on its side, or on its top
-    following = jnp.where(lowest <= top, state - 1, (_bits(out) & ~_LEVEL) | after)
-    following = jnp.where(state < 0, state, following)
-    # the state itself must not be what this last choice offers: so vmap's choice between it and the
-    # result, one for a row, stays a branch around all of the above for rows that are done
-    return jnp.where((lowest <= top) & is_level & (state >= 0), _bits(-hit), following)
-
-
-def _of_level(level: Int[Array, "*n"], values: tuple[int, ...]) -> Int[Array, "*n"]:
-    """Return the value of each ray's level."""
-    chosen = jnp.full_like(level, values[0])
-    for k, value in enumerate(values[1:], start=1):
-        chosen = jnp.where(level == k, value, chosen)
-    return chosen
-
-
-def _depth(state: Int[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return the depth in a march's state, m; rounded to 2 um at 3 m."""
-    return jax.lax.bitcast_convert_type(state & ~_LEVEL, jnp.float32)
-
-
-def _bits(depth: Float[Array, "*n"]) -> Int[Array, "*n"]:
-    """Return the bits of a depth; as an integer a depth below zero, -0 too, is below zero."""
-    return jax.lax.bitcast_convert_type(depth, jnp.int32)
 
 
 def _links(

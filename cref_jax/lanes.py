@@ -173,7 +173,7 @@ def _atlas(
     grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
     origin = (0.0, -0.5 * across * c.cell)
     return Atlas(
-        terrain=terrain.from_heights(grid, c.cell, origin),
+        terrain=terrain.from_heights(grid, c.cell, origin, lane=(along, across)),
         sizes=sizes,
         kinds=tuple(numbers),
         columns=(along, across),

@@ -190,7 +190,7 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pix
     """Return what all cameras see, in the order in which the network reads it.
 
     `start` puts the robots on the kinds of lane in turn, for good: so it is known beforehand which
-    of them stand on lanes that are level across, and these images cost an eighth.
+    of them stand on lanes that are level across, and these images cost less.
     """
     kinds = world.lanes.kind_of(np.arange(state.kind.shape[0]))
     is_profile = np.asarray(world.lanes.is_profile)[kinds]

@@ -29,12 +29,13 @@ _ABOVE = 1e-5  # m, a second contact lies further than this in front of the firs
 class Terrain:
     """A window of a grid of columns."""
 
-    tops: Float[Array, " N"]  # m, of the columns row by row, then of each size of BLOCKS
+    tops: Float[Array, " N"]  # m, of the columns row by row, of each larger size of BLOCKS, bottoms
     origin: Float[Array, " 2"]  # m, outer corner of the window's first column
     first: Int[Array, " 2"]  # the window's first column
     size: Int[Array, " 2"]  # columns in the window
     cell: float = flax.struct.field(pytree_node=False)  # m, side of a column
     shape: tuple[int, int] = flax.struct.field(pytree_node=False)  # X, Y, of the whole grid
+    lane: tuple[int, int] = flax.struct.field(pytree_node=False)  # columns that blocks stay within
 
     @property
     def heights(self) -> Float[Array, "X Y"]:
@@ -43,17 +44,30 @@ class Terrain:
 
 
 def from_heights(
-    heights: Float[ArrayLike, "X Y"], cell: float, origin: tuple[float, float] = (0.0, 0.0)
+    heights: Float[ArrayLike, "X Y"],
+    cell: float,
+    origin: tuple[float, float] = (0.0, 0.0),
+    lane: tuple[int, int] | None = None,
 ) -> Terrain:
-    """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell."""
+    """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell.
+
+    The grid consists of whole tiles of `lane` columns, of which each has blocks of its own; if not
+    given it is one tile.
+    """
     heights = jnp.asarray(heights, jnp.float32)
+    lane = lane or (heights.shape[0], heights.shape[1])
+    if heights.shape[0] % lane[0] or heights.shape[1] % lane[1]:
+        raise ValueError(f"{heights.shape} columns are not whole tiles of {lane}")
+    larger = [_blocks(heights, lane, side).max((2, 5)) for side in BLOCKS[1:]]
+    bottoms = _blocks(heights, lane, BLOCKS[-1]).min((2, 5))
     return Terrain(
-        tops=jnp.concatenate([_block_tops(heights, side).reshape(-1) for side in BLOCKS]),
+        tops=jnp.concatenate([part.reshape(-1) for part in (heights, *larger, bottoms)]),
         origin=jnp.asarray(origin, jnp.float32),
         first=jnp.zeros(2, jnp.int32),
         size=jnp.asarray(heights.shape, jnp.int32),
         cell=float(cell),
         shape=heights.shape,
+        lane=lane,
     )
 
 
@@ -68,6 +82,8 @@ def tile(
     Every tile has the coordinates of tile (0, 0), so positions stay small and float32 stays exact.
     The heights are shared, not copied: under vmap over row and column they stay without that axis.
     """
+    if size != terrain.lane:
+        raise ValueError(f"the grid is divided into tiles of {terrain.lane} columns, not {size}")
     size_ij = jnp.asarray(size, jnp.int32)
     place = jnp.stack([jnp.asarray(row, jnp.int32), jnp.asarray(column, jnp.int32)])
     return dataclasses.replace(terrain, first=terrain.first + place * size_ij, size=size_ij)
@@ -117,28 +133,20 @@ def contact_planes(
 
 
 def block_top(
-    terrain: Terrain,
-    level: Int[Array, "*rays"],
-    i: Int[Array, "*rays"],
-    j: Int[Array, "*rays"],
-) -> tuple[Float[Array, "*rays"], Bool[Array, "*rays"]]:
-    """Return the height of the highest column of a block, m, and whether all are as high.
+    terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"], level: int
+) -> Float[Array, "*n"]:
+    """Return the height of the highest column of a block, m.
 
     It is the block of BLOCKS[level] x BLOCKS[level] columns around column (i, j) of the window, or
-    around the nearest one inside of it. Blocks are counted from the grid's first column, not from
-    the window's. Larger blocks are at most one unit in the last place higher than their columns.
+    around the nearest one inside of it. Blocks are counted from the window's first column and end
+    with the window.
     """
-    i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
-    j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
-    start, index = 0, jnp.zeros_like(i)
-    for k, side in enumerate(BLOCKS):
-        rows, across = (-(-n // side) for n in terrain.shape)
-        shift = side.bit_length() - 1
-        index = jnp.where(level == k, start + (i >> shift) * across + (j >> shift), index)
-        start += rows * across
-    # unsigned: an index that may be negative would be looked at once more
-    top = terrain.tops.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds")
-    return top, (level == 0) | (_bits(top) & 1 == 1)
+    return _block(terrain, i, j, level, level)
+
+
+def block_bottom(terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return the height of the lowest column of one of the largest blocks, m: see block_top."""
+    return _block(terrain, i, j, len(BLOCKS) - 1, len(BLOCKS))
 
 
 class _Offset(NamedTuple):
@@ -191,25 +199,36 @@ def _height(terrain: Terrain, i: Int[Array, "..."], j: Int[Array, "..."]) -> Flo
     return terrain.tops.at[i * terrain.shape[1] + j].get(mode="promise_in_bounds")
 
 
-def _block_tops(heights: Float[Array, "X Y"], side: int) -> Float[Array, "x y"]:
-    """Return the height of the highest column of each block, m.
+def _block(
+    terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"], level: int, part: int
+) -> Float[Array, "*n"]:
+    """Return what a part of `tops` holds of the block around a column."""
+    counts = [_block_counts(terrain.lane, side) for side in (*BLOCKS, BLOCKS[-1])]
+    lanes = [whole // n for whole, n in zip(terrain.shape, terrain.lane, strict=True)]
+    start = lanes[0] * lanes[1] * sum(rows * across for rows, across in counts[:part])
+    rows, across = counts[level]
+    row, column = terrain.first // jnp.asarray(terrain.lane, jnp.int32)
+    shift = BLOCKS[level].bit_length() - 1
+    i = row * rows + (jnp.clip(i, 0, terrain.size[0] - 1) >> shift)
+    j = column * across + (jnp.clip(j, 0, terrain.size[1] - 1) >> shift)
+    index = start + i * (lanes[1] * across) + j
+    # unsigned: an index that may be negative would be looked at once more
+    return terrain.tops.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds")
 
-    The lowest bit says whether all columns of the block are as high: one number, because a second
-    one would double the time to read it. A height whose bit is wrong is rounded up.
-    """
-    if side == 1:
-        return heights
-    padding = [(0, -n % side) for n in heights.shape]
-    blocks = jnp.pad(heights, padding, mode="edge")
-    blocks = blocks.reshape(blocks.shape[0] // side, side, blocks.shape[1] // side, side)
-    top, bottom = blocks.max((1, 3)), blocks.min((1, 3))
-    wrong = (_bits(top) & 1 == 1) != (top == bottom)
-    return jnp.where(wrong, jnp.nextafter(top, jnp.inf), top)
+
+def _blocks(heights: Float[Array, "X Y"], lane: tuple[int, int], side: int) -> Array:
+    """Return the heights as [lanes, blocks, side, lanes, blocks, side]; a lane's border goes on."""
+    x, y = (whole // n for whole, n in zip(heights.shape, lane, strict=True))
+    rows, across = _block_counts(lane, side)
+    more_x, more_y = rows * side - lane[0], across * side - lane[1]
+    lanes = heights.reshape(x, lane[0], y, lane[1])
+    lanes = jnp.pad(lanes, [(0, 0), (0, more_x), (0, 0), (0, more_y)], mode="edge")
+    return lanes.reshape(x, rows, side, y, across, side)
 
 
-def _bits(x: Float[Array, "*rays"]) -> Int[Array, "*rays"]:
-    """Return the bits of a float."""
-    return jax.lax.bitcast_convert_type(x, jnp.int32)
+def _block_counts(lane: tuple[int, int], side: int) -> tuple[int, int]:
+    """Return how many blocks of a side a lane has along and across."""
+    return -(-lane[0] // side), -(-lane[1] // side)
 
 
 def _nearest(offsets: list[_Offset]) -> _Offset:

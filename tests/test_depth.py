@@ -373,7 +373,7 @@ def test_every_tile_looks_as_if_it_were_alone():
 
 
 def test_cameras_on_different_tiles_share_one_grid():
-    whole = terrain.from_heights(np.zeros((12, 10)), 0.02)
+    whole = terrain.from_heights(np.zeros((12, 10)), 0.02, lane=(6, 5))
     look = lambda row, p: depth.render(
         terrain.tile(whole, (6, 5), row, 0), p, jnp.eye(3), jnp.asarray(NONE), CAMERA
     )

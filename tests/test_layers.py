@@ -15,7 +15,7 @@ LAYERS = [
     {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "recurrent"},
     {"paper", "proportion", "stall", "disturbance", "processes", "layers", "patches", "holding"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
-    {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
+    {"kinematics", "lanes", "march", "host_physics", "outcomes", "learning_charts", "profile"},
     {"physics", "depth", "foothold", "evaluation_page"},
     {"world", "observation", "reward"},
     {"episode"},

@@ -203,7 +203,7 @@ def test_a_point_that_has_blown_up_reads_no_memory_outside_of_the_grid(p):
 def test_a_tile_does_not_see_its_neighbours():
     rng = np.random.default_rng(0)
     grid = rng.uniform(-0.03, 0.03, (4 * SHAPE[0], 3 * SHAPE[1])).astype(np.float32)
-    whole = terrain.from_heights(grid, CELL, ORIGIN)
+    whole = terrain.from_heights(grid, CELL, ORIGIN, lane=SHAPE)
     p = rng.uniform([-0.11, 0.24, -0.02], [0.13, 0.46, 0.04], (300, 3)).astype(np.float32)
     on_tile = jax.jit(lambda r, c, p: terrain.closest_point(terrain.tile(whole, SHAPE, r, c), p))
     for row, column in [(0, 0), (2, 1), (3, 2)]:
@@ -215,7 +215,7 @@ def test_a_tile_does_not_see_its_neighbours():
 
 
 def test_robots_on_different_tiles_share_one_grid():
-    whole = terrain.from_heights(np.zeros((12, 10)), CELL)
+    whole = terrain.from_heights(np.zeros((12, 10)), CELL, lane=(6, 5))
     tiled = lambda r, p: terrain.closest_point(terrain.tile(whole, (6, 5), r, 0), p)
     program = str(jax.make_jaxpr(jax.vmap(tiled))(jnp.arange(2), jnp.zeros((2, 3))))
     assert f"f32[{whole.tops.size}]" in program
@@ -223,35 +223,43 @@ def test_robots_on_different_tiles_share_one_grid():
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (8, 32), (50, 77)])
-def test_a_block_is_as_high_as_its_highest_column_and_knows_whether_it_is_level(shape):
+def test_a_block_is_as_high_as_its_highest_column(shape):
     rng = np.random.default_rng(shape[0])
-    heights = rng.choice([-0.3, 0.0, 0.0, 0.1], (8, 8)).repeat(10, 0).repeat(10, 1)
-    heights = heights[: shape[0], : shape[1]].astype(np.float32)
+    heights = rng.uniform(-0.3, 0.1, shape).astype(np.float32)
     ground = terrain.from_heights(heights, CELL)
     i, j = np.meshgrid(*(np.arange(-3, n + 3) for n in shape), indexing="ij")
     inner_i, inner_j = np.clip(i, 0, shape[0] - 1), np.clip(j, 0, shape[1] - 1)
+    block_top = jax.jit(terrain.block_top, static_argnames="level")
+    bottom = terrain.block_bottom(ground, jnp.array(i), jnp.array(j))
     for level, side in enumerate(terrain.BLOCKS):
-        levels = np.full(i.shape, level, np.int32)
-        top, is_level = jax.jit(terrain.block_top)(ground, levels, jnp.array(i), jnp.array(j))
+        top = block_top(ground, jnp.array(i), jnp.array(j), level=level)
         for n in np.ndindex(i.shape):
             a, b = inner_i[n] // side * side, inner_j[n] // side * side
             block = heights[a : a + side, b : b + side]
-            assert is_level[n] == (np.ptp(block) == 0.0)
-            assert block.max() <= top[n] <= np.nextafter(block.max(), np.float32(np.inf))
-            assert level > 0 or top[n] == block.max()
+            assert top[n] == block.max()
+            assert level < len(terrain.BLOCKS) - 1 or bottom[n] == block.min()
 
 
-def test_a_tile_reads_blocks_of_the_whole_grid():
-    heights = np.arange(64 * 64, dtype=np.float32).reshape(64, 64)
-    ground = terrain.tile(terrain.from_heights(heights, CELL), (20, 20), 1, 2)
-    # column (1, 2) of the tile is (21, 42) of the grid, in the blocks from (20, 40) and (16, 32)
-    read = lambda level, i, j: float(
-        terrain.block_top(ground, jnp.int32(level), jnp.int32(i), jnp.int32(j))[0]
-    )
-    assert read(0, 1, 2) == 21 * 64 + 42
-    np.testing.assert_allclose(read(1, 1, 2), 23 * 64 + 43, rtol=1e-6)
-    np.testing.assert_allclose(read(2, 1, 2), 31 * 64 + 47, rtol=1e-6)
-    assert read(0, -50, 99) == 20 * 64 + 59  # outside of the tile its border goes on
+def test_a_tiles_blocks_hold_its_own_columns_and_no_others():
+    heights = np.arange(60 * 60, dtype=np.float32).reshape(60, 60)
+    ground = terrain.tile(terrain.from_heights(heights, CELL, lane=(20, 20)), (20, 20), 1, 2)
+    read = lambda level, i, j: float(terrain.block_top(ground, jnp.int32(i), jnp.int32(j), level))
+    # column (5, 2) of the tile is (25, 42) of the grid; in the tile's blocks from (4, 0) and (0, 0)
+    assert read(0, 5, 2) == 25 * 60 + 42
+    assert read(1, 5, 2) == 27 * 60 + 43
+    assert read(2, 5, 2) == 35 * 60 + 55
+    assert read(3, 5, 2) == 39 * 60 + 59  # a block of 64 ends with the tile
+    assert read(2, 18, 2) == 39 * 60 + 55  # and so does one of 16 that begins at 16
+    assert float(terrain.block_bottom(ground, jnp.int32(5), jnp.int32(2))) == 20 * 60 + 40
+    assert read(0, -50, 99) == 20 * 60 + 59  # outside of the tile its border goes on
+
+
+def test_a_grid_is_cut_into_the_tiles_that_it_was_made_of():
+    whole = terrain.from_heights(np.zeros((12, 10)), CELL, lane=(6, 5))
+    with pytest.raises(ValueError, match=r"tiles of \(6, 5\) columns, not \(4, 5\)"):
+        terrain.tile(whole, (4, 5), 0, 0)
+    with pytest.raises(ValueError, match=r"\(12, 10\) columns are not whole tiles of \(5, 5\)"):
+        terrain.from_heights(np.zeros((12, 10)), CELL, lane=(5, 5))
 
 
 def test_a_sphere_has_one_or_two_planes():
