@@ -12,7 +12,7 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "layers"},
+    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "layers", "kernels"},
     {"paper", "proportion", "stall", "disturbance", "processes"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "host_physics", "outcomes", "learning_charts", "profile"},
