@@ -213,7 +213,7 @@ def _steps(world: World, robots: rollout.Robots) -> Any:
 
     def step(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, Any]:
         action = 0.3 * jax.random.normal(key, (*state.step.shape, joints))
-        state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, state, action)
+        state, outcome = env.step_all(world, state, action)
         return state, (outcome.reward.sum(), outcome.observation.privileged.sum())
 
     return jax.lax.scan(step, robots.env, jax.random.split(jax.random.key(1), STEPS))

@@ -70,8 +70,37 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
 
     A new command comes after the reward, so the reward is for the command that the policy has seen.
     """
+    return _renewed(world, *_advanced(world, state, action))
+
+
+def step_all(
+    world: World, state: EnvState, action: Float[Array, "E J"]
+) -> tuple[EnvState, Outcome]:
+    """Advance E robots, each as `step` does.
+
+    Under `jax.vmap` a new episode is drawn for every robot in every step; here, only in a step in
+    which an episode ends.
+    """
+    reached = jax.vmap(_advanced, in_axes=(None, 0, 0))(world, state, action)
+    ending = reached.outcome.ending
+    renew = lambda: jax.vmap(_renewed, in_axes=(None, 0, 0, 0))(world, *reached)
+    keep = lambda: (reached.state, reached.outcome)
+    return jax.lax.cond(jnp.any(ending.terminated | ending.truncated), renew, keep)
+
+
+class _Reached(NamedTuple):
+    """Where a step has led to, before any reset."""
+
+    state: EnvState
+    outcome: Outcome
+    keys: PRNGKeyArray  # for the next level, the reset and the first observation
+
+
+def _advanced(world: World, state: EnvState, action: Float[Array, " J"]) -> _Reached:
+    """Return the state that a step leads to, as if the episode went on, and what it gives."""
     c = world.config
-    key, key_push, key_command, key_level, key_reset, key_see = jax.random.split(state.key, 6)
+    keys = jax.random.split(state.key, 6)
+    key, key_push, key_command, key_see = keys[0], keys[1], keys[2], keys[5]
     state = episode.pushed(world, state.replace(key=key), key_push)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
@@ -93,14 +122,22 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     lived = episode.commanded(world, episode.marked(world, lived), key_command)
     last = observe(world, lived, key_see)
 
-    done = ending.terminated | ending.truncated
-    rank, level = episode.promoted(world, lived, ending, key_level)
-    fresh = episode.reset(world, key_reset, lived.kind, level).replace(rank=rank)
-    following = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, lived)
-    first = observe(world, fresh, key_see)
-    seen = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, last)
     gained = jnp.where(unstable, 0.0, gained)
-    return following, Outcome(seen, last.privileged, gained, ending, measures)
+    return _Reached(lived, Outcome(last, last.privileged, gained, ending, measures), keys[3:])
+
+
+def _renewed(
+    world: World, lived: EnvState, outcome: Outcome, keys: PRNGKeyArray
+) -> tuple[EnvState, Outcome]:
+    """Put the robot on a lane again if its episode is over, and observe it there."""
+    key_level, key_reset, key_see = keys
+    done = outcome.ending.terminated | outcome.ending.truncated
+    rank, level = episode.promoted(world, lived, outcome.ending, key_level)
+    fresh = episode.reset(world, key_reset, lived.kind, level).replace(rank=rank)
+    first = observe(world, fresh, key_see)
+    choose = lambda new, old: jnp.where(done, new, old)
+    seen = jax.tree.map(choose, first, outcome.observation)
+    return jax.tree.map(choose, fresh, lived), outcome._replace(observation=seen)
 
 
 def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Float[Array, "H W"]:

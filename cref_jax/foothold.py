@@ -87,9 +87,7 @@ def candidates(
 
     A window with a point nearer than half a second of the forward command does not count.
     """
-    # foot by foot: XLA compiles one query for both into code that takes twice as long on a CPU
-    z = jnp.stack([_heights(ground, sole[foot], heading[foot], c) for foot in range(2)])
-    found = windows(z, c)
+    found = _windows(_heights(ground, sole, heading, c), c)
     x, _ = _lattice(c)
     nearest = x[: _count(c) * c.stride : c.stride]  # of the points in each window
     accepted = (
@@ -110,11 +108,16 @@ def windows(z: Float[Array, "*n X Y"], c: config.Foothold) -> Windows:
     x and y of the points are a lattice, so only the sums with z are worked out; those of squares
     are split into a part within the rows across the foot and a part between them.
     """
+    return _windows([z[..., j] for j in range(c.points[1])], c)
+
+
+def _windows(columns: list[Float[Array, "*n X"]], c: config.Foothold) -> Windows:
+    """Return the same, from the heights of each column of points along the foot."""
     x, y = _lattice(c)
     length, width = c.window
     if width != c.points[1]:
         raise ValueError(f"a window must be as wide as the buffer: {width}, not {c.points[1]}")
-    columns = [z[..., j] for j in range(width)]  # summed one by one: a reduction over 5 is slow
+    # summed one by one: a reduction over 5 is slow
     row_z = sum(columns, start=jnp.zeros(())) / width
     off_row = [column - row_z for column in columns]
     row_y = sum(off * float(at) for off, at in zip(off_row, y, strict=True))
@@ -192,12 +195,15 @@ def _lattice(c: config.Foothold) -> tuple[Float[np.ndarray, " X"], Float[np.ndar
 
 
 def _heights(
-    ground: Terrain, sole: Float[Array, "3"], heading: Float[Array, ""], c: config.Foothold
-) -> Float[Array, "X Y"]:
-    """Return the ground's height above the sole at each point of one foot's buffer, m."""
-    grid = np.stack(np.meshgrid(*_lattice(c), indexing="ij"), axis=-1).reshape(-1, 2)
-    points = sole[:2] + geometry.rotate_yaw(heading, jnp.asarray(grid))
-    return (terrain.height_at(ground, points) - sole[2]).reshape(c.points)
+    ground: Terrain, sole: Float[Array, "F 3"], heading: Float[Array, " F"], c: config.Foothold
+) -> list[Float[Array, "F X"]]:
+    """Return the ground's height above each sole at each column of its foot's buffer, m."""
+    x, y = _lattice(c)
+    # the points of one column after the other, as `_windows` takes them
+    ahead, aside = np.tile(x, len(y)), np.repeat(y, len(x))
+    by_x, by_y = geometry.turned_yaw(heading[:, None], ahead[None], aside[None])
+    z = terrain.height_under(ground, sole[:, :1] + by_x, sole[:, 1:2] + by_y)
+    return list((z - sole[:, 2:]).reshape(2, len(y), len(x)).swapaxes(0, 1))
 
 
 def _summed(of_rows: Float[Array, "*n X"], c: config.Foothold) -> Float[Array, "*n K"]:

@@ -4,7 +4,7 @@ A quaternion is [w, x, y, z], of unit length, and turns a body's vector into its
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 SMALL = 1e-12  # keeps a division finite; far below any length that matters
 
@@ -66,11 +66,17 @@ def yaw(q: Float[Array, "*n 4"]) -> Float[Array, "*n"]:
 
 def rotate_yaw(angle: Float[Array, "*#n"], v: Float[Array, "*#n d"]) -> Float[Array, "*n d"]:
     """Return v, of two or three components, turned by `angle`, rad, about +z."""
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    x, y = v[..., 0], v[..., 1]
-    turned = jnp.stack([c * x - s * y, s * x + c * y], axis=-1)
+    turned = jnp.stack(turned_yaw(angle, v[..., 0], v[..., 1]), axis=-1)
     above = jnp.broadcast_to(v[..., 2:], (*turned.shape[:-1], v.shape[-1] - 2))
     return jnp.concatenate([turned, above], axis=-1)
+
+
+def turned_yaw(
+    angle: Float[ArrayLike, "*#n"], x: Float[ArrayLike, "*#n"], y: Float[ArrayLike, "*#n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Return the vectors (x, y) turned by `angle`, rad, about +z, as x and y apart."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x - s * y, s * x + c * y
 
 
 def quat_from_z(normal: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:

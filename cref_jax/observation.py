@@ -98,9 +98,9 @@ def height_scan(
 ) -> Float[Array, " M"]:
     """m_t: height of the base above a grid of ground points around it, m, less the nominal 0.6."""
     x, y = np.meshgrid(np.linspace(*c.x), np.linspace(*c.y), indexing="ij")
-    grid = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float32)
-    points = qpos[:2] + geometry.rotate_yaw(geometry.yaw(qpos[3:7]), jnp.asarray(grid))
-    clearance = qpos[2] - terrain.height_at(ground, points)
+    grid = (x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+    by_x, by_y = geometry.turned_yaw(geometry.yaw(qpos[3:7]), *grid)
+    clearance = qpos[2] - terrain.height_under(ground, qpos[0] + by_x, qpos[1] + by_y)
     return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
 
 

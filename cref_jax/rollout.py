@@ -180,7 +180,7 @@ def advance(
     world: World, robots: Robots, memory: Memory, action: Float[Array, "E J"]
 ) -> tuple[Robots, Outcome]:
     """Step every robot with its action, and its camera."""
-    state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, robots.env, action)
+    state, outcome = env.step_all(world, robots.env, action)
     over = outcome.ending.terminated | outcome.ending.truncated
     feed = robots.feed and _next_feed(world, robots.feed, robots.env, over)
     return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome

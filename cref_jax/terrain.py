@@ -6,18 +6,21 @@ outside of the window the heights of its border continue. Frames: x along the la
 """
 
 import dataclasses
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from cref_jax import kernels
+
 FAR = 1.0  # m, distance of a contact plane that is not there
 BLOCKS = (1, 4, 16, 64)  # columns, sides of the blocks whose tops are stored; powers of two
 _TOUCHING = 1e-6  # m, no distance is taken as shorter, so that every direction has a length
 _REACH = 3  # columns; a foot that swings at 8 m/s is 4 cm in a wall after one substep
-_NEIGHBOURS = [
+_COLUMNS = [  # that are looked at around a point, its own first
+    (0, 0),
     *((a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)),
     *((k * a, k * b) for k in range(2, _REACH + 1) for a, b in ((-1, 0), (1, 0), (0, -1), (0, 1))),
 ]
@@ -91,8 +94,15 @@ def tile(
 
 def height_at(terrain: Terrain, xy: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
     """Return the height of the ground under each point, m."""
-    columns = jnp.floor((jnp.asarray(xy) - terrain.origin) * (1.0 / terrain.cell))
-    return _height(terrain, columns[..., 0].astype(jnp.int32), columns[..., 1].astype(jnp.int32))
+    xy = jnp.asarray(xy)
+    return height_under(terrain, xy[..., 0], xy[..., 1])
+
+
+def height_under(
+    terrain: Terrain, x: Float[Array, "*n"], y: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """Return the height of the ground under each point (x, y), m."""
+    return _read(terrain.tops, [_column_under(terrain, x, y)])[0]
 
 
 def closest_point(
@@ -107,9 +117,15 @@ def closest_point(
     normal points from the edge to `p`; of two equally close points the one of p's own column is
     taken.
     """
-    offsets, outside = _offsets(terrain, p)
-    nearest = _nearest(offsets)
-    return _plane(p, nearest, outside)
+    place = _place(terrain, p[0], p[1])
+    around = _read(terrain.tops, [_column(terrain, place, *by) for by in _COLUMNS])
+
+    @kernels.apart
+    def search(place: _Place, z: Float[Array, ""], around: list[Float[Array, ""]]) -> Any:
+        offsets, outside = _offsets(terrain.cell, place, z, around)
+        return _nearest(offsets), outside
+
+    return _plane(p, *search(place, p[2], around))
 
 
 def contact_planes(
@@ -123,7 +139,9 @@ def contact_planes(
     """
     if count not in (1, 2):
         raise ValueError(f"a sphere has 1 or 2 contact planes, not {count}")
-    offsets, outside = _offsets(terrain, p)
+    place = _place(terrain, p[0], p[1])
+    around = _read(terrain.tops, [_column(terrain, place, *by) for by in _COLUMNS])
+    offsets, outside = _offsets(terrain.cell, place, p[2], around)
     nearest = _nearest(offsets)
     planes = [_plane(p, nearest, outside)]
     if count == 2:
@@ -149,6 +167,19 @@ def block_bottom(terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"]) -> 
     return _block(terrain, i, j, len(BLOCKS) - 1, len(BLOCKS))
 
 
+class _Place(NamedTuple):
+    """Where a point is among the columns of the whole grid, as scalars."""
+
+    i: Int[Array, ""]  # its column, which may be outside of the window
+    j: Int[Array, ""]
+    first_i: Int[Array, ""]  # of the window
+    last_i: Int[Array, ""]
+    first_j: Int[Array, ""]
+    last_j: Int[Array, ""]
+    east: Float[Array, ""]  # m, from its column's corner, never quite on an edge
+    north: Float[Array, ""]
+
+
 class _Offset(NamedTuple):
     """From `p` to the closest point of one column: a vector and its square, as scalars, m.
 
@@ -162,41 +193,79 @@ class _Offset(NamedTuple):
     square: Float[Array, ""]
 
 
-def _offsets(terrain: Terrain, p: Float[Array, " 3"]) -> tuple[list[_Offset], Float[Array, ""]]:
-    """Return the ways from `p` to the columns around, its own first, and 1 outside, -1 inside.
-
-    Outside of the ground a column's closest point is sought in the box below its height, inside
-    of the ground in the air above it.
-    """
-    x = (p[0] - terrain.origin[0]) * (1.0 / terrain.cell)  # columns
-    y = (p[1] - terrain.origin[1]) * (1.0 / terrain.cell)
+@kernels.apart
+def _place(terrain: Terrain, x: Float[Array, ""], y: Float[Array, ""]) -> _Place:
+    """Return where a point is."""
+    x = (x - terrain.origin[0]) * (1.0 / terrain.cell)  # columns
+    y = (y - terrain.origin[1]) * (1.0 / terrain.cell)
     i, j = jnp.floor(x), jnp.floor(y)
     # barrier: rounded differently in the length and in the vector, a normal would not be a unit
     u, v = jax.lax.optimization_barrier((x - i, y - j))
-    east = jnp.clip(u * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
-    north = jnp.clip(v * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
-    to = lambda inside, k: (k + (k < 0)) * terrain.cell - inside if k else jnp.zeros_like(inside)
-    to_x = {k: to(east, k) for k in range(-_REACH, _REACH + 1)}
-    to_y = {k: to(north, k) for k in range(-_REACH, _REACH + 1)}
+    inside = lambda part: jnp.clip(part * terrain.cell, _TOUCHING, terrain.cell - _TOUCHING)
     i, j = i.astype(jnp.int32), j.astype(jnp.int32)
+    # one number a point, though it is the same for all points of a robot: read in step with i and j
+    each = lambda of_window: of_window + jnp.zeros_like(i)
+    first, last = terrain.first, terrain.first + terrain.size - 1
+    return _Place(
+        i=first[0] + i,
+        j=first[1] + j,
+        first_i=each(first[0]),
+        last_i=each(last[0]),
+        first_j=each(first[1]),
+        last_j=each(last[1]),
+        east=inside(u),
+        north=inside(v),
+    )
 
-    own = _height(terrain, i, j) - p[2]
-    outside = jnp.where(own <= 0.0, 1.0, -1.0)
-    z = -outside * jnp.maximum(jnp.abs(own), 0.5 * _TOUCHING)  # half: its own column comes first
-    offsets = [_Offset(jnp.zeros_like(z), jnp.zeros_like(z), z, z * z)]
-    for a, b in _NEIGHBOURS:
-        z = _height(terrain, i + a, j + b) - p[2]
-        z = -outside * jnp.maximum(-outside * z, 0.0)
-        square = to_x[a] * to_x[a] + to_y[b] * to_y[b] + z * z
-        offsets.append(_Offset(to_x[a], to_y[b], z, square))
-    return offsets, outside
+
+def _column(terrain: Terrain, place: _Place, a: int, b: int) -> Int[Array, ""]:
+    """Return which column is `a` and `b` further, or the nearest one inside of the window."""
+    i = jnp.clip(place.i + a, place.first_i, place.last_i)
+    j = jnp.clip(place.j + b, place.first_j, place.last_j)
+    return i * terrain.shape[1] + j
 
 
-def _height(terrain: Terrain, i: Int[Array, "..."], j: Int[Array, "..."]) -> Float[Array, "..."]:
-    """Return the height of column (i, j) of the window, or of the nearest one inside of it."""
+@kernels.apart
+def _column_under(
+    terrain: Terrain, x: Float[Array, "*n"], y: Float[Array, "*n"]
+) -> Int[Array, "*n"]:
+    """Return which column is under each point, or the nearest one inside of the window."""
+    i = jnp.floor((x - terrain.origin[0]) * (1.0 / terrain.cell)).astype(jnp.int32)
+    j = jnp.floor((y - terrain.origin[1]) * (1.0 / terrain.cell)).astype(jnp.int32)
     i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
     j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
-    return terrain.tops.at[i * terrain.shape[1] + j].get(mode="promise_in_bounds")
+    return i * terrain.shape[1] + j
+
+
+@kernels.apart
+def _read(tops: Float[Array, " N"], columns: list[Int[Array, "*n"]]) -> list[Float[Array, "*n"]]:
+    """Return the heights of the columns of these numbers, m."""
+    # unsigned: a number that may be negative would be looked at once more
+    get = lambda column: tops.at[column.astype(jnp.uint32)].get(mode="promise_in_bounds")
+    return [get(column) for column in columns]
+
+
+def _offsets(
+    cell: float, place: _Place, z: Float[Array, ""], around: list[Float[Array, ""]]
+) -> tuple[list[_Offset], Float[Array, ""]]:
+    """Return the ways from a point to the columns around, and 1 outside of the ground, -1 inside.
+
+    `z` is the point's height and `around` those of `_COLUMNS`, m. Outside of the ground a column's
+    closest point is sought in the box below its height, inside of the ground in the air above it.
+    """
+    to = lambda inside, k: (k + (k < 0)) * cell - inside if k else jnp.zeros_like(inside)
+    to_x = {k: to(place.east, k) for k in range(-_REACH, _REACH + 1)}
+    to_y = {k: to(place.north, k) for k in range(-_REACH, _REACH + 1)}
+
+    own = around[0] - z
+    outside = jnp.where(own <= 0.0, 1.0, -1.0)
+    up = -outside * jnp.maximum(jnp.abs(own), 0.5 * _TOUCHING)  # half: its own column comes first
+    offsets = [_Offset(jnp.zeros_like(up), jnp.zeros_like(up), up, up * up)]
+    for (a, b), height in zip(_COLUMNS[1:], around[1:], strict=True):
+        up = -outside * jnp.maximum(-outside * (height - z), 0.0)
+        square = to_x[a] * to_x[a] + to_y[b] * to_y[b] + up * up
+        offsets.append(_Offset(to_x[a], to_y[b], up, square))
+    return offsets, outside
 
 
 def _block(

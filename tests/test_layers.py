@@ -12,7 +12,7 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "recurrent"},
+    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "recurrent", "kernels"},
     {"paper", "proportion", "stall", "disturbance", "processes", "layers", "patches", "holding"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "march", "host_physics", "outcomes", "learning_charts", "profile"},

@@ -1,0 +1,32 @@
+"""Where XLA for a CPU ends one kernel and begins the next.
+
+It would rather compute a value again in each kernel that reads it, and again for each element where
+a kernel reads it more than once: an index into the ground for each of seventeen columns, a search
+for each of three coordinates. A loop of simple steps over arrays in memory is also one that the
+CPU's vector units can run, and a fused one often is not.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+from jax.experimental.scheduling_groups import xla_metadata_call
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def apart(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function as one whose arguments and results are in memory, on a CPU.
+
+    It computes the same. An accelerator has its own way to divide a program into kernels.
+    """
+
+    @functools.wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        if jax.default_backend() != "cpu":
+            return function(*args, **kwargs)
+        return xla_metadata_call(function, inlineable="false")(*args, **kwargs)
+
+    return called
