@@ -11,10 +11,10 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
-.PHONY: help setup train eval play report export sim2sim bench params test test-fast check format clean
+.PHONY: help setup train eval play report export sim2sim bench gpu-program params test test-fast check format clean
 
 help:
-	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile
 
 setup: $(READY)  ## make .venv and install everything, with CUDA where a GPU answers
 
@@ -38,6 +38,9 @@ sim2sim: $(READY)  ## walk the whole robot in MuJoCo C: ARGS="--policy policy --
 
 bench: $(READY)  ## measure steps a second on this machine
 	$(BIN)/python -m cref_jax.bench $(ARGS)
+
+gpu-program: $(READY)  ## compile the training program for a GPU, without one: ARGS="--gpu h100"
+	$(BIN)/python -m cref_jax.gpu_program $(ARGS)
 
 params: $(READY)  ## count the parameters of each variant of the network
 	$(BIN)/python -m cref_jax.params $(ARGS)

@@ -35,7 +35,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Physics:
-    """The simulation step, the same in both engines."""
+    """The simulation step, the same in every engine."""
 
     timestep: float = 0.005  # s; assumed: four substeps a control step are stable
     substeps: int = 4  # 4 x 5 ms = 20 ms = 50 Hz, Sec. II-D

@@ -164,7 +164,7 @@ def _warp(
         farthest: float,
         image: wp.array(dtype=float, ndim=2),  # type: ignore[valid-type]
     ):
-        e, k = wp.tid()
+        e, k = wp.tid()  # type: ignore[misc]
         hit = wp.mesh_query_ray(mesh, position[e], rotation[e] * rays[k], farthest)
         image[e, k] = wp.where(hit.result, hit.t, farthest)
 

@@ -2,13 +2,9 @@
 
 Each contact sphere owns a plane. Before every substep the terrain is asked for the surface point
 and normal nearest to the sphere, and the plane is put there. The engine sees only planes against
-spheres: one contact a plane, at constant cost, the same in MJX and in MuJoCo C.
-
-This is the only module that knows `mujoco.mjx`.
+spheres: one contact a plane, at constant cost, the same in every engine.
 """
 
-import contextlib
-import io
 from typing import Literal, NamedTuple, Protocol
 
 import jax
@@ -18,13 +14,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cref_jax import config, geometry, kinematics, robot, terrain
+from cref_jax.device_physics import MjxEngine, WarpEngine
 from cref_jax.host_physics import Dynamics, HostEngine, Substep
 
-with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed
-    from mujoco import mjx
-
 MAX_DEPTH = 0.05  # m; a foot that swings at 8 m/s is 4 cm in a wall after one substep
-EngineName = Literal["auto", "mjx", "mujoco"]
+Backend = Literal["mjx", "mujoco", "warp"]
+EngineName = Literal["auto", "mjx", "mujoco", "warp"]
 
 
 class Body(NamedTuple):
@@ -59,24 +54,33 @@ class Physics:
         self,
         robot_config: config.Robot,
         physics_config: config.Physics,
-        engine: Literal["mjx", "mujoco"],
+        engine: Backend,
         threads: int = 0,
     ) -> None:
-        """Compile the model and make the engine; `threads` is for MuJoCo C, 0 means all cores."""
+        """Compile the model and make the engine; `threads` is for MuJoCo C, 0 means all cores.
+
+        Raises:
+            ConfigError: the engine is not installed.
+        """
         self.config = physics_config
         self.robot = robot.load(robot_config)
         self.feet = np.array(self.robot.ankles)  # body ids
         spec = robot.spec(robot.moving(robot_config), physics_config)
-        if engine == "mujoco":
+        if engine != "mjx":
             robot.add_force_sensors(spec)
+        if engine == "mujoco":
             robot.solve_sparsely(spec)
+        if engine == "warp":  # it never resets a state by itself, and takes no flag against it
+            spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.model = spec.compile()
         self.tree = kinematics.tree(self.model)
-        self.engine: Engine = (
-            HostEngine(self.model, self.robot.trunk, threads)
-            if engine == "mujoco"
-            else _MjxEngine(self.model, self.robot.trunk, self.feet)
-        )
+        self.engine: Engine
+        if engine == "mujoco":
+            self.engine = HostEngine(self.model, self.robot.trunk, threads)
+        elif engine == "warp":
+            self.engine = WarpEngine(self.model, self.robot.trunk)
+        else:
+            self.engine = MjxEngine(self.model, self.robot.trunk, self.feet)
 
     def nominal_dynamics(self) -> Dynamics:
         """Return the dynamics of the robot as it is, on nominal ground."""
@@ -143,73 +147,8 @@ class Physics:
         return body, force.mean(axis=0)
 
 
-def resolve_engine(name: EngineName) -> Literal["mjx", "mujoco"]:
+def resolve_engine(name: EngineName) -> Backend:
     """Return the engine for this machine: MuJoCo C on a CPU, MJX on an accelerator."""
     if name != "auto":
         return name
     return "mujoco" if jax.default_backend() == "cpu" else "mjx"
-
-
-class _MjxEngine:
-    """Advances robots by one substep with MJX: the engine for an accelerator."""
-
-    def __init__(self, model: mujoco.MjModel, trunk: int, foot_bodies: np.ndarray) -> None:
-        self._model = mjx.put_model(model, impl="jax")
-        self._data = mjx.make_data(model, impl="jax")
-        self._trunk = trunk
-        collide = lambda data: mjx.collision(self._model, mjx.kinematics(self._model, data))
-        contact = jax.jit(collide)(self._data)._impl.contact  # without jit it takes 40 s
-        owner = model.geom_bodyid[np.asarray(contact.geom)[:, 1]]
-        self._foot = np.asarray(foot_bodies)[:, None] == owner[None, :]  # [F, contacts]
-        self._rows = np.asarray(contact.efc_address)[:, None] + np.arange(4)  # pyramid's edges
-
-    def substep(
-        self,
-        qpos: Float[Array, " Q"],
-        qvel: Float[Array, " V"],
-        warmstart: Float[Array, " V"],
-        target: Float[Array, " M"],
-        plane_position: Float[Array, "P 3"],
-        plane_rotation: Float[Array, "P 4"],
-        dynamics: Dynamics,
-    ) -> Substep:
-        """Return the state one substep on."""
-        before = self._data.replace(
-            qpos=qpos,
-            qvel=qvel,
-            qacc_warmstart=warmstart,
-            ctrl=target,
-            mocap_pos=plane_position,
-            mocap_quat=plane_rotation,
-        )
-        after = mjx.step(self._varied(dynamics), before)
-        return Substep(after.qpos, after.qvel, after.qacc_warmstart, self._foot_force(after))
-
-    def _varied(self, dynamics: Dynamics) -> mjx.Model:
-        model, trunk = self._model, self._trunk
-        bias, driven = model.actuator_biasprm, np.arange(dynamics.kp.size)
-        return model.replace(
-            pair_friction=model.pair_friction.at[:, :2].set(dynamics.friction),
-            body_mass=model.body_mass.at[trunk].add(dynamics.payload),
-            body_ipos=model.body_ipos.at[trunk].add(dynamics.com_shift),
-            actuator_gainprm=model.actuator_gainprm.at[driven, 0].set(dynamics.kp),
-            actuator_biasprm=bias.at[driven, 1].set(-dynamics.kp).at[driven, 2].set(-dynamics.kd),
-        )
-
-    def _foot_force(self, data: mjx.Data) -> Float[Array, "F 3"]:
-        """Return the contact force on each foot, summed from the pyramids' edge forces.
-
-        MJX's contact sensors repeat one pair's force, so the solver's forces are read instead.
-        """
-        contact = data._impl.contact
-        edge = data._impl.efc_force[self._rows]  # [contacts, 4]
-        in_contact = jnp.stack(
-            [
-                edge.sum(axis=1),
-                contact.friction[:, 0] * (edge[:, 0] - edge[:, 1]),
-                contact.friction[:, 1] * (edge[:, 2] - edge[:, 3]),
-            ],
-            axis=1,
-        )
-        in_world = jnp.einsum("ck,ckw->cw", in_contact, contact.frame)
-        return self._foot.astype(np.float32) @ in_world

@@ -12,10 +12,21 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 NAMES = [path.stem for path in FILES if path.stem != "__init__"]
 
 LAYERS = [
-    {"config", "geometry", "gaussian", "readout", "deploy", "leaves", "recurrent", "kernels"},
+    {
+        "config",
+        "geometry",
+        "gaussian",
+        "readout",
+        "deploy",
+        "leaves",
+        "recurrent",
+        "kernels",
+        "hlo",
+    },
     {"paper", "proportion", "stall", "disturbance", "processes", "layers", "patches", "holding"},
     {"terrain", "shapes", "robot", "host_call", "film", "page", "curves"},
     {"kinematics", "lanes", "march", "host_physics", "outcomes", "learning_charts", "profile"},
+    {"device_physics"},
     {"physics", "depth", "foothold", "evaluation_page"},
     {"world", "observation", "reward"},
     {"episode"},
@@ -26,7 +37,7 @@ LAYERS = [
     {"runs", "peers", "stand_in", "table", "run_page", "ood"},
     {"exported", "ood_verdict", "transfer"},
     {"watch", "ood_suite"},
-    {"train", "eval", "play", "bench", "params", "export", "sim2sim", "report"},
+    {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
 
@@ -66,9 +77,9 @@ def test_a_module_imports_only_from_lower_layers(name):
     assert {other for other in siblings(name) if RANK[other] >= RANK[name]} == set()
 
 
-def test_only_physics_touches_mjx():
+def test_only_device_physics_touches_mjx():
     users = [name for name in NAMES if any("mjx" in i.split(".") for i in imports(tree(name)))]
-    assert set(users) <= {"physics"}
+    assert users == ["device_physics"]
 
 
 def test_the_package_itself_is_only_a_docstring():

@@ -5,6 +5,7 @@ robots by one substep, so each engine is compiled once.
 """
 
 import dataclasses
+import importlib.util
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
@@ -37,7 +38,23 @@ RISER = 2.0  # m, x of the first step's front, 0.15 m high
 ONE_SUBSTEP = dataclasses.replace(config.Physics(), substeps=1)
 TIMESTEP = ONE_SUBSTEP.timestep
 GRAVITY = 9.81  # m/s^2
-ENGINES = ["mujoco", "mjx"]
+HAS_WARP = importlib.util.find_spec("warp") is not None
+WARP = pytest.param(
+    "warp",
+    marks=pytest.mark.skipif(
+        not HAS_WARP, reason="NVIDIA Warp is not installed: pip install 'cref-jax[warp]'"
+    ),
+)
+ON_DEVICE = ["mjx", WARP]  # the engines for an accelerator; they run on a CPU as well
+# Warp's line search takes other steps: where Newton's last iteration is not enough, the two part
+CONVERGED = dataclasses.replace(ONE_SUBSTEP, iterations=50, line_search=50)
+AGAINST_C = pytest.mark.parametrize(
+    ("engine", "reference"),
+    [
+        pytest.param("mjx", "mujoco", id="mjx"),
+        pytest.param("warp, converged", "mujoco, converged", id="warp", marks=WARP.marks),
+    ],
+)
 
 
 class Run(NamedTuple):
@@ -50,8 +67,11 @@ class Run(NamedTuple):
 
 @pytest.fixture(scope="module")
 def physics():
-    make = lambda engine: Physics(config.Robot(), ONE_SUBSTEP, engine, threads=2)
-    return {engine: make(engine) for engine in ENGINES}
+    settings = {"mujoco": ONE_SUBSTEP, "mujoco, converged": CONVERGED, "mjx": ONE_SUBSTEP}
+    if HAS_WARP:
+        settings |= {"warp": ONE_SUBSTEP, "warp, converged": CONVERGED}
+    make = lambda name, c: Physics(config.Robot(), c, name.split(",")[0], threads=2)
+    return {name: make(name, c) for name, c in settings.items()}
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +87,17 @@ def ground():
 
 @pytest.fixture(scope="module")
 def substep(physics, ground):
-    """Return engine -> (body, dynamics) -> body and force on the feet, PD at the nominal pose."""
+    """Return engine -> (body, dynamics, target) -> body and force on the feet.
+
+    The motors hold the nominal pose, or each robot's target.
+    """
 
     def make(p):
-        target = jnp.tile(p.robot.nominal_pose, (2, 1))
-        once = lambda body, dynamics: p.step(ground, body, target, jnp.int32(0), dynamics)
-        return jax.jit(jax.vmap(once))
+        once = lambda body, dynamics, target: p.step(
+            ground, body, jnp.stack([target, target]), jnp.int32(0), dynamics
+        )
+        every, rest = jax.jit(jax.vmap(once)), jnp.tile(p.robot.nominal_pose, (ROBOTS, 1))
+        return lambda body, dynamics, target=rest: every(body, dynamics, target)
 
     return {engine: make(p) for engine, p in physics.items()}
 
@@ -153,23 +178,71 @@ def varied(physics, rng) -> Dynamics:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), changed)
 
 
-# MJX against MuJoCo C
+# The engines for an accelerator against MuJoCo C
 
 
 @pytest.mark.slow
+@AGAINST_C
 @pytest.mark.parametrize("where", AT)
-def test_one_substep_is_the_same_in_both_engines(physics, x2, substep, put_down, where):
+def test_one_substep_is_the_same_as_in_mujoco_c(
+    physics, x2, substep, put_down, where, engine, reference
+):
     rng = np.random.default_rng(0)
     qpos = poses(x2, rng.uniform(*AT[where], ROBOTS), rng, spread=0.3, tilt=0.3, yaw=0.5)
     depth = rng.uniform(-0.002, 0.006, ROBOTS)
     is_held = np.arange(physics["mujoco"].model.nv) >= 6 + len(x2.nominal_pose)
     qvel = np.where(is_held, 0.1, 0.5) * rng.normal(size=(ROBOTS, len(is_held)))
     body, dynamics = body_of(put_down(qpos, depth), qvel), varied(physics, rng)
-    ours, force = substep["mjx"](body, dynamics)
-    theirs, expected = substep["mujoco"](body, dynamics)
+    ours, force = substep[engine](body, dynamics)
+    theirs, expected = substep[reference](body, dynamics)
     assert (np.linalg.norm(expected, axis=-1) > 0.0).any(axis=1).mean() > 0.5
     assert np.abs(ours.qvel - theirs.qvel).max() <= 2e-3
     assert np.abs(force - expected).max() <= 0.1
+
+
+@pytest.mark.slow
+@AGAINST_C
+@pytest.mark.parametrize("height", [1.0, -0.01], ids=["in the air", "on the ground"])
+def test_motors_at_their_limit_are_the_same_as_in_mujoco_c(
+    physics, x2, substep, height, engine, reference
+):
+    # an engine that damps such motors is off by 7 to 9 rad/s in half of these robots
+    rng, driven = np.random.default_rng(0), len(x2.nominal_pose)
+    qpos = poses(x2, rng.uniform(*AT["flat"], ROBOTS), rng, spread=0.3, tilt=0.3, yaw=0.5)
+    qpos[:, 2] = x2.standing_height + height
+    pace = np.where(np.arange(physics["mujoco"].model.nv) < 6, 0.5, 2.0)  # m/s, rad/s
+    qvel = pace * rng.normal(size=(ROBOTS, len(pace)))
+    target = x2.nominal_pose + rng.uniform(-1.5, 1.5, (ROBOTS, driven))
+    body, dynamics = body_of(qpos, qvel), varied(physics, rng)
+    error = target - qpos[:, 7 : 7 + driven]
+    torque = dynamics.kp * error - dynamics.kd * qvel[:, 6 : 6 + driven]
+    saturated = np.abs(torque) >= x2.effort
+    assert 0.2 < saturated.mean() < 0.4 and saturated.any(axis=1).mean() > 0.95
+    target = jnp.asarray(target, jnp.float32)
+    ours, force = substep[engine](body, dynamics, target)
+    theirs, expected = substep[reference](body, dynamics, target)
+    off = np.abs(ours.qvel - theirs.qvel).max(axis=1)
+    # on the ground six iterations are not always enough
+    all_converge = height > 0.0 or "converged" in reference
+    assert (off <= 5e-4).all() if all_converge else np.quantile(off, 0.98) <= 5e-4
+    assert np.abs(force - expected).max() <= 0.5
+
+
+def test_only_a_motor_at_its_limit_becomes_a_constant_torque(physics, x2):
+    p, nominal_dynamics = physics["mjx"], physics["mjx"].nominal_dynamics()
+    qpos = jnp.concatenate([jnp.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]), x2.rest_pose])
+    np.testing.assert_array_equal(x2.kp[:4], [100.0, 100.0, 100.0, 150.0])  # N m / rad
+    np.testing.assert_array_equal(x2.kd[:4], [4.0, 3.0, 3.0, 5.0])  # N m s / rad
+    np.testing.assert_array_equal(x2.effort[:4], 120.0)  # N m
+    # 100 x 1.1 = 110; 100 x 1.3 = 130, too much; 130 - 3 x 5 = 115; 150 x -1 = -150, too much
+    target = jnp.asarray(x2.rest_pose).at[:4].add(jnp.array([1.1, 1.3, 1.3, -1.0]))
+    qvel = jnp.zeros(p.model.nv).at[6 + 2].set(5.0)
+    found = p.engine.model(qpos, qvel, target, nominal_dynamics)
+    gain, bias = p.model.actuator_gainprm.copy(), p.model.actuator_biasprm.copy()
+    gain[[1, 3]], bias[[1, 3]] = 0.0, 0.0
+    bias[[1, 3], 0] = 120.0, -120.0
+    np.testing.assert_array_equal(found.actuator_gainprm, gain.astype(np.float32))
+    np.testing.assert_array_equal(found.actuator_biasprm, bias.astype(np.float32))
 
 
 def held(substep, start: Body, dynamics: Dynamics, seconds: float) -> Run:
@@ -184,7 +257,7 @@ def held(substep, start: Body, dynamics: Dynamics, seconds: float) -> Run:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["mujoco", *ON_DEVICE])
 def test_the_feet_of_a_standing_robot_bear_its_weight(physics, x2, substep, put_down, engine):
     places = np.full(ROBOTS, 1.0)
     start = body_of(put_down(poses(x2, places, np.random.default_rng(0), yaw=3.0), 0.0))
@@ -346,8 +419,46 @@ def test_a_riser_throws_a_fast_foot_back_as_boxes_do(physics, x2, substep, centr
 
 
 def test_the_engine_is_chosen_by_the_device():
-    assert [resolve_engine(name) for name in ENGINES] == ENGINES
+    names = ["mujoco", "mjx", "warp"]
+    assert [resolve_engine(name) for name in names] == names
     assert resolve_engine("auto") == ("mujoco" if jax.default_backend() == "cpu" else "mjx")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ON_DEVICE)
+def test_a_state_that_is_not_finite_harms_no_other(physics, x2, substep, put_down, engine):
+    start = body_of(put_down(poses(x2, np.full(ROBOTS, 1.0), np.random.default_rng(0)), 0.002))
+    sound, _ = substep[engine](start, nominal(physics))
+    broken = start._replace(qpos=start.qpos.at[2, 9].set(jnp.nan))
+    found, _ = substep[engine](broken, nominal(physics))
+    assert np.isnan(found.qvel[2]).all()
+    np.testing.assert_array_equal(np.delete(found.qvel, 2, 0), np.delete(sound.qvel, 2, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", [WARP])
+def test_batches_of_batches_have_room_for_every_contact(physics, x2, put_down, engine):
+    # one robot bears on the ground with eight spheres, and so do the other 199
+    p = physics[engine]
+    body = body_of(put_down(poses(x2, np.full(ROBOTS, 1.0), np.random.default_rng(0)), 0.004))
+    flat = terrain.from_heights(jnp.zeros((1, 1)), CELL)
+
+    def force(body: Body) -> np.ndarray:
+        planes, rest = p.planes(flat, body), jnp.asarray(x2.rest_pose)
+        return p.engine.substep(*body, rest, *planes, p.nominal_dynamics()).force
+
+    halves = jax.tree.map(lambda x: x.reshape(2, ROBOTS // 2, -1), body)
+    found = np.asarray(jax.jit(jax.vmap(jax.vmap(force)))(halves)).reshape(ROBOTS, 2, 3)
+    assert (found[:, :, 2] > 100.0).all()  # N
+    np.testing.assert_allclose(found, np.broadcast_to(found[:1], found.shape), atol=0.1)
+
+
+def test_an_engine_that_is_not_installed_is_one_line(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(
+        config.ConfigError, match=r"'warp' needs .*: pip install 'cref-jax\[warp\]'"
+    ):
+        Physics(config.Robot(), ONE_SUBSTEP, "warp")
 
 
 # The engine for a CPU

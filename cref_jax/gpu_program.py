@@ -1,0 +1,259 @@
+"""The training program for an NVIDIA GPU, compiled on a machine that has none.
+
+    python -m cref_jax.gpu_program --gpu h100
+
+XLA compiles for a GPU from a description of the card. Nothing is executed and no array of a robot
+is made: world and state are shapes. It needs the packages of the CUDA plugin, and no driver. What
+is estimated is a bound by the card's bandwidth, its products and the launches, not a measurement.
+"""
+
+import collections
+import dataclasses
+import importlib.util
+import os
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax.experimental import topologies
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+from jaxtyping import PyTree
+from rich.console import Console
+from rich.table import Table
+
+from cref_jax import cli, config, depth, hlo, lanes, learn, runs
+from cref_jax.config import Config, ConfigError
+from cref_jax.physics import Backend, Body, Physics
+from cref_jax.world import World
+
+LAUNCH = 3e-6  # s; assumed: the least time of a kernel, its launch included
+BANDWIDTH_SHARE = 0.8  # assumed: what a kernel gets of the card's bandwidth
+PRODUCT_SHARE = 0.25  # assumed: what a product gets of the card's TF32 rate
+MARCH_TURNS = 80  # assumed: blocks that the longest ray of a frame crosses
+
+STAGES = (  # stage, then a file and, if it has to be, a function of the stack; the first that fits
+    ("physics: MJX, line search", "mjx/_src/solver.py", "_linesearch"),
+    ("physics: MJX, Newton", "mjx/_src/solver.py", ""),
+    ("physics: MJX, before the solver", "cref_jax/device_physics.py", ""),
+    ("physics: tangent planes", "cref_jax/physics.py", "planes"),
+    ("physics: rest", "cref_jax/physics.py", "step"),
+    ("update", "cref_jax/ppo.py", "update"),
+    ("policy", "cref_jax/rollout.py", "act"),
+    ("depth", "cref_jax/rollout.py", "exposed"),
+    ("environment: rest", "cref_jax/env.py", ""),
+    ("rollout: rest", "cref_jax/rollout.py", ""),
+)
+REST = "rest"
+
+
+class Card(NamedTuple):
+    """An NVIDIA GPU, as XLA wants it described; from its data sheet."""
+
+    name: str
+    capability: tuple[int, int]
+    multiprocessors: int
+    threads: int  # of a multiprocessor
+    shared: int  # bytes of shared memory of a multiprocessor
+    shared_block: int  # bytes of it that one block can have
+    cache: int  # bytes of the second level
+    clock: float  # GHz
+    memory: int  # bytes
+    bandwidth: float  # bytes/s
+    products: float  # flop/s in TF32
+
+
+KIB, MIB, GB, T = 2**10, 2**20, 10**9, 1e12
+CARDS = {
+    "h100": Card(
+        *("NVIDIA H100 80GB HBM3", (9, 0), 132, 2048, 228 * KIB, 227 * KIB),
+        *(50 * MIB, 1.98, 80 * GB, 3.35 * T, 495 * T),
+    ),
+    "a100": Card(
+        *("NVIDIA A100-SXM4-80GB", (8, 0), 108, 2048, 164 * KIB, 163 * KIB),
+        *(40 * MIB, 1.41, 80 * GB, 2.04 * T, 156 * T),
+    ),
+    "4090": Card(
+        *("NVIDIA GeForce RTX 4090", (8, 9), 128, 1536, 100 * KIB, 99 * KIB),
+        *(72 * MIB, 2.52, 24 * GB, 1.01 * T, 82.6 * T),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Compile the training program for a GPU, without one, and estimate its time."""
+
+    gpu: Literal["h100", "a100", "4090"] = "h100"
+    """the card"""
+    terrain: str = "mixed"
+    """what the robots stand on"""
+    num_envs: int | None = None
+    """robots at once; as in `make train` on a GPU when left out"""
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+class Stage(NamedTuple):
+    """What a part of an iteration takes."""
+
+    launches: float
+    bytes: float
+    flops: float  # of matrix products
+    seconds: float
+
+
+def main() -> None:
+    """Run the command line."""
+    options = tyro.cli(Options, prog="python -m cref_jax.gpu_program")
+    with cli.one_line_errors(options.debug):
+        c = runs.composed(options.terrain, None, "gpu")
+        if options.num_envs:
+            c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=options.num_envs))
+        config.check(c)
+        card = CARDS[options.gpu]
+        prepare()
+        mesh = mesh_of(card)
+        with Console().status(f"compiling for {card.name} (five minutes of one core)"):
+            compiled = traced(c, "mjx", mesh).lower().compile()
+        stages = estimate(hlo.Program(compiled.as_text()), c, card)
+        show(c, card, compiled, stages)
+
+
+def prepare() -> None:
+    """Set JAX up for a plugin without a device.
+
+    Raises:
+        ConfigError: the plugin is not installed.
+    """
+    if not any(importlib.util.find_spec(f"jax_cuda{n}_plugin") for n in (12, 13)):
+        raise ConfigError("compiling for a GPU needs JAX's plugin: pip install 'cref-jax[cuda12]'")
+    os.environ.setdefault("XLA_FLAGS", "--xla_gpu_force_compilation_parallelism=1")  # memory
+    jax.config.update("jax_platforms", "cpu")  # the plugin looks for no device, and still compiles
+    jax.config.update("jax_traceback_in_locations_limit", -1)  # stages are told by whole stacks
+
+
+def mesh_of(card: Card) -> Mesh:
+    """Return one device that is a description of this card."""
+    found = topologies.get_topology_desc(
+        card.name, "cuda", target_config=_description(card), topology="1x1x1"
+    )
+    return Mesh(np.array(found.devices), (learn.AXIS,), axis_types=(AxisType.Auto,))
+
+
+def _description(card: Card) -> str:
+    """Return the card as a text of XLA's GpuTargetConfigProto."""
+    major, minor = card.capability
+    return f"""
+    gpu_device_info {{
+      threads_per_block_limit: 1024
+      threads_per_warp: 32
+      shared_memory_per_block: 49152
+      shared_memory_per_core: {card.shared}
+      shared_memory_per_block_optin: {card.shared_block}
+      threads_per_core_limit: {card.threads}
+      core_count: {card.multiprocessors}
+      fpus_per_core: 128
+      block_dim_limit_x: 2147483647
+      block_dim_limit_y: 65535
+      block_dim_limit_z: 65535
+      registers_per_core_limit: 65536
+      registers_per_block_limit: 65536
+      memory_bandwidth: {card.bandwidth:.0f}
+      l2_cache_size: {card.cache}
+      clock_rate_ghz: {card.clock}
+      device_memory_size: {card.memory}
+      cuda_compute_capability {{ major: {major} minor: {minor} }}
+    }}
+    runtime_version {{ major: 12 minor: 8 patch: 0 }}
+    platform_name: "CUDA"
+    dnn_version_info {{ major: 9 minor: 10 }}
+    device_description_str: "{card.name}"
+    """
+
+
+def traced(c: Config, engine: Backend, mesh: Mesh) -> jax.stages.Traced:
+    """Return one iteration of training, traced from shapes on the devices of a mesh."""
+    world = world_of_shapes(c, engine, NamedSharding(mesh, P()))
+    return learn.chunk.trace(world, learn.shapes(world, mesh), mesh, 1)
+
+
+def world_of_shapes(c: Config, engine: Backend, place: NamedSharding) -> World:
+    """Return the world with shapes for arrays; to settle robots would compile their physics.
+
+    Raises:
+        ConfigError: the terrain cannot be used, or the engine is not installed.
+    """
+    shape = lambda *sizes: jax.ShapeDtypeStruct(sizes, jnp.float32, sharding=place)
+    physics, count = Physics(c.robot, c.physics, engine), c.episode.bank_size
+    positions, velocities = physics.model.nq, physics.model.nv
+    bank = Body(shape(count, positions), shape(count, velocities), shape(count, velocities))
+    return World(c, physics, _shapes(lanes.build(c.terrain), place), bank)
+
+
+def _shapes(arrays: PyTree, place: NamedSharding) -> PyTree:
+    """Return the shapes of arrays, on these devices."""
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x), sharding=place), arrays
+    )
+
+
+def estimate(program: hlo.Program, c: Config, card: Card) -> dict[str, Stage]:
+    """Return what each stage of an iteration takes, the longest first."""
+    frames = depth.most_frames(c.ppo.horizon, c.camera, c.physics.control_period)
+
+    def turns(stack: tuple[hlo.Frame, ...]) -> float:
+        if _is_at(stack, "mjx/_src/solver.py", ""):
+            return float(
+                c.physics.iterations
+            )  # the robot that takes longest takes as many as it may
+        if _is_at(stack, "cref_jax/depth.py", ""):
+            return float(MARCH_TURNS)
+        return frames / c.ppo.horizon if _is_at(stack, "cref_jax/rollout.py", "_next_feed") else 1.0
+
+    found = collections.defaultdict(lambda: Stage(0.0, 0.0, 0.0, 0.0))
+    for kernel in program.kernels(turns):
+        name = stage_of(kernel.stack)
+        name = stage_of(kernel.loop) if name == REST else name  # a copy of what the loop carries
+        moved = kernel.bytes / (BANDWIDTH_SHARE * card.bandwidth)
+        seconds = max(LAUNCH, moved, kernel.flops / (PRODUCT_SHARE * card.products))
+        one = Stage(1.0, kernel.bytes, kernel.flops, seconds)
+        found[name] = Stage(*(a + kernel.times * b for a, b in zip(found[name], one, strict=True)))
+    return dict(sorted(found.items(), key=lambda item: -item[1].seconds))
+
+
+def stage_of(stack: tuple[hlo.Frame, ...]) -> str:
+    """Return the stage that a line of the program belongs to, by the functions around it."""
+    return next((name for name, *place in STAGES if _is_at(stack, *place)), REST)
+
+
+def _is_at(stack: tuple[hlo.Frame, ...], file: str, function: str) -> bool:
+    return any(
+        frame.file.endswith(file) and function in ("", *frame.function.split("."))
+        for frame in stack
+    )
+
+
+def show(c: Config, card: Card, compiled: jax.stages.Compiled, stages: dict[str, Stage]) -> None:
+    """Print the memory and the stages of an iteration."""
+    samples = c.run.num_envs * c.ppo.horizon
+    table = Table(title=f"{c.terrain.name}, {c.run.num_envs} robots x {c.ppo.horizon}, {card.name}")
+    for column in ("stage", "launches", "GB", "Tflop", "ms, estimated"):
+        table.add_column(column, justify="left" if column == "stage" else "right")
+    total = Stage(*(sum(column) for column in zip(*stages.values(), strict=True)))
+    for name, s in [*stages.items(), ("an iteration", total)]:
+        work = f"{s.launches:,.0f}", f"{s.bytes / 1e9:,.1f}", f"{s.flops / 1e12:,.2f}"
+        table.add_row(name, *work, f"{1e3 * s.seconds:,.1f}")
+    console = Console()
+    console.print(table)
+    if memory := compiled.memory_analysis():
+        gib = memory.argument_size_in_bytes / 2**30, memory.temp_size_in_bytes / 2**30
+        console.print(f"memory: {gib[0]:.2f} GiB of state, {gib[1]:.2f} GiB besides")
+    console.print(f"estimated, nothing was run: {samples / total.seconds:,.0f} samples/s at most")
+
+
+if __name__ == "__main__":
+    main()
