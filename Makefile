@@ -46,10 +46,10 @@ params: $(READY)  ## count the parameters of each variant of the network
 	$(BIN)/python -m cref_jax.params $(ARGS)
 
 test: $(READY)  ## run every test: ARGS="-k depth"
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-fast: $(READY)  ## run the tests that take seconds
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder -m "not slow" $(ARGS)
 
 check: $(READY)  ## format, lint and types, without changing a file
 	$(BIN)/ruff format --check .

@@ -18,7 +18,17 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cref_jax import cli, evaluation, evaluation_page, exported, ood_verdict, paper, runs, table
+from cref_jax import (
+    cli,
+    evaluation,
+    evaluation_page,
+    exported,
+    ood_verdict,
+    paper,
+    processes,
+    runs,
+    table,
+)
 from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.world import World
@@ -74,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
         cli.prepare()
-        subjects = [_subject(path, options.engine) for path in _sources(options)]
+        subjects = [_subject(path, options) for path in _sources(options)]
         source = subjects[0].source
         out = options.out or (source if exported.is_run(source) else Path())
         if options.film:
@@ -106,8 +116,11 @@ def _sources(options: Options) -> list[Path]:
     return given or [exported.chosen(None, None)]
 
 
-def _subject(source: Path, engine: EngineName) -> Subject:
-    world = runs.world_of(exported.read_config(source), engine)
+def _subject(source: Path, options: Options) -> Subject:
+    # trials are shared out among the devices, of which a CPU has one a core
+    in_trials = options.suite in ("table", "cross")
+    threads = max(processes.cores() // jax.device_count(), 1) if in_trials else 0
+    world = runs.world_of(exported.read_config(source), options.engine, threads)
     return Subject(source, exported.load(source, world), world)
 
 

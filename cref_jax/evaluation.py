@@ -111,7 +111,8 @@ def cross(
 ) -> Crossing:
     """Return how often the policy's mean action comes to the end of lanes with such obstacles."""
     world = crossing_world(c, physics, kind, size)
-    made = trials.run(world, trials.follow(train), *crossing_lanes(count), seed, block(), ended)
+    asked = trials.Asked(np.arange(count), *crossing_lanes(count))
+    made = trials.run(world, trials.follow(train), asked, seed, block(), ended)
     done = made.succeeded
     return Crossing(
         kind=kind,
@@ -147,7 +148,7 @@ def trial_config(c: Config) -> Config:
 
 
 def block() -> int:
-    """Return how many robots are stepped together in trials; assumed: fills the device."""
+    """Return how many robots a device steps together in trials; assumed: fills it."""
     return 100 if jax.default_backend() == "cpu" else 1000
 
 

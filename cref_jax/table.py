@@ -73,12 +73,17 @@ def judge(
     ended: Callable[[int], None] = lambda count: None,
 ) -> dict[Cell, Outcomes]:
     """Return what a policy makes of `count` trials of each cell; `ended` is told of each end."""
-    found = {}
-    for cell in paper.METHODS[paper.FULL].success:
-        on = lanes_of(cell, count, w.lanes.kinds)
-        made = trials.run(w, trials.follow(train), *on, seed, evaluation.block(), ended)
-        found[cell] = Outcomes(made, on.kind == w.lanes.kinds.index("descent"))
-    return found
+    every = list(paper.METHODS[paper.FULL].success)
+    on = [lanes_of(cell, count, w.lanes.kinds) for cell in every]
+    kind, level = map(np.concatenate, zip(*on, strict=True))
+    asked = trials.Asked(np.tile(np.arange(count), len(every)), kind, level)
+    made = trials.run(w, trials.follow(train), asked, seed, evaluation.block(), ended)
+    down = kind == w.lanes.kinds.index("descent")
+    part = lambda k: slice(k * count, (k + 1) * count)
+    return {
+        cell: Outcomes(Trials(*(x[part(k)] for x in made)), down[part(k)])
+        for k, cell in enumerate(every)
+    }
 
 
 def cells(judged: Sequence[Mapping[Cell, Outcomes]]) -> list[dict[str, Any]]:

@@ -1,19 +1,26 @@
 """Trials: robots start anew, and each is followed until it first comes to its lane's end or fails.
 
-Blocks of a fixed number of robots are stepped together, so what becomes of trial i depends on the
-seed, on i and on its lane alone: not on how many trials are asked for. (Another size of block, as
-on another device, rounds matrix products otherwise.)
+Each device steps a block of robots together, and where one has come to its end the next trial
+begins. A trial's place in a block comes from its number, so what becomes of it depends on the seed,
+on its number and on its lane alone: not on how many trials are asked for, nor on the number of
+devices. (Another size of block, as on another device, rounds matrix products otherwise.)
 """
 
+import collections
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import episode, ppo, rollout, stall
+from cref_jax import depth, episode, ppo, rollout, stall
+from cref_jax.config import Config
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending
 from cref_jax.rollout import Robots
@@ -23,9 +30,18 @@ FALLS = ("unstable", "tilted", "low", "hit", "dropped")  # of Ending; the first 
 FAILURES = (*FALLS, "stalled", "late")  # late: on its feet and moving, but not at the end in time
 ENDINGS = ("finished", *FAILURES)
 SEED = 1_000_003  # apart from the seeds of training
-CHUNK = 50  # control steps between two looks at whether all have come to an end
+CHUNK = 50  # control steps between two looks at which have come to an end
+AXIS = "robots"  # of the mesh
 
 Walker = Callable[[World, Robots], tuple[Robots, Outcome]]  # a jax.tree_util.Partial, so no retrace
+
+
+class Asked(NamedTuple):
+    """N trials to make."""
+
+    number: Int[np.ndarray, " N"]  # from which it starts; twice only on different lanes
+    kind: Int[np.ndarray, " N"]  # of the lane
+    level: Int[np.ndarray, " N"]
 
 
 class Trials(NamedTuple):
@@ -72,31 +88,45 @@ def begin(
 def run(
     world: World,
     walker: Walker,
-    kind: Int[np.ndarray, " N"],
-    level: Int[np.ndarray, " N"],
+    asked: Asked,
     seed: int,
     block: int,
     ended: Callable[[int], None] = lambda count: None,
 ) -> Trials:
-    """Return what becomes of N trials, trial i on the lane of that kind and level.
+    """Return what becomes of the trials.
 
     Args:
         world: kinds in it that are not level across must be alone in it: see rollout.exposed.
         walker: what steps the robots.
-        kind: of each lane.
-        level: of each lane.
+        asked: the trials.
         seed: of the starts and commands.
-        block: robots that are stepped together.
+        block: robots that are stepped together on one device.
         ended: is told how many trials have come to an end since the last time.
     """
-    parts = []
-    for first in range(0, len(kind), block):
-        number = np.arange(first, first + block)
-        lane = np.minimum(number, len(kind) - 1)  # a last block is filled, and what it adds dropped
-        count = min(block, len(kind) - first)
-        robots = begin(world, seed, number, kind[lane], level[lane])
-        parts.append(_followed(world, walker, robots, count, ended))
-    return Trials(*map(np.concatenate, zip(*parts, strict=True)))
+    places = _Places(asked.number, block)
+    mesh = jax.make_mesh(
+        (places.blocks,), (AXIS,), axis_types=(AxisType.Auto,),
+        devices=jax.devices()[: places.blocks],
+    )  # fmt: skip
+    world, walker = jax.device_put((world, walker), NamedSharding(mesh, P()))
+    key = jax.random.key(SEED + seed)
+    found: dict[int, Trials] = {}
+    robots, clock = None, 0
+    while places.left:
+        if not places.courses:
+            robots, clock = None, 0
+        if _is_in_phase(world.config, clock) and (new := places.filled()).size:
+            lanes = (jnp.asarray(x[places.trial], jnp.int32) for x in asked)
+            begun = _begin_on(world, key, *lanes, mesh)
+            places.begin(new, np.asarray(begun.env.command[:, 0]))
+            is_new = np.isin(np.arange(places.trial.size), new)
+            robots = begun if robots is None else _replaced(robots, begun, is_new, world.config)
+        robots, part = _steps(world, walker, robots, mesh)
+        clock += CHUNK
+        over = places.follow(jax.tree.map(np.asarray, part), world.config)
+        found |= over
+        ended(len(over))
+    return Trials(*map(np.concatenate, zip(*(found[k] for k in sorted(found)), strict=True)))
 
 
 def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trials:
@@ -125,22 +155,64 @@ def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trial
     )
 
 
-def _followed(
-    world: World, walker: Walker, robots: Robots, count: int, ended: Callable[[int], None]
-) -> Trials:
-    """Step the robots until the first `count` have come to an end; say so as they do."""
-    c = world.config
-    period, speed = c.physics.control_period, np.asarray(robots.env.command[:count, 0])
-    traces: list[Trace] = []
-    over = 0
-    while over < count and len(traces) * CHUNK * period < c.episode.length:
-        robots, part = _steps(world, walker, robots)
-        traces.append(jax.tree.map(lambda x: np.asarray(x)[:, :count], part))
-        trace = jax.tree.map(lambda *x: np.concatenate(x), *traces)
-        first = np.minimum(*_ends(trace, speed, period))
-        before, over = over, int((first < len(trace.progress)).sum())
-        ended(over - before)
-    return judged(trace, speed, period)
+@dataclasses.dataclass
+class _Course:
+    """A trial that is under way, and what has been seen of it."""
+
+    trial: int
+    speed: Float[np.ndarray, "1"]  # m/s, commanded
+    parts: list[Trace] = dataclasses.field(default_factory=list)
+
+
+class _Places:
+    """Which trial is made at each place of the blocks, and which ones wait for one."""
+
+    def __init__(self, number: Int[np.ndarray, " N"], block: int) -> None:
+        row = number % block
+        self._waiting = [collections.deque(np.flatnonzero(row == k)) for k in range(block)]
+        self.blocks = min(jax.device_count(), max(map(len, self._waiting)))
+        self.trial = np.zeros(self.blocks * block, int)  # where none is left, any will do
+        self.courses: dict[int, _Course] = {}  # by place
+
+    @property
+    def left(self) -> bool:
+        """Whether there are trials that have not come to an end."""
+        return bool(self.courses) or any(self._waiting)
+
+    def filled(self) -> Int[np.ndarray, " n"]:
+        """Return the free places that have been given the next trial."""
+        new = []
+        for place in range(self.trial.size):
+            waiting = self._waiting[place % len(self._waiting)]
+            if place not in self.courses and waiting:
+                self.trial[place] = waiting.popleft()
+                new.append(place)
+        return np.array(new, int)
+
+    def begin(self, new: Int[np.ndarray, " n"], speed: Float[np.ndarray, " E"]) -> None:
+        """Follow the trials at these places from here on."""
+        self.courses |= {k: _Course(int(self.trial[k]), speed[k : k + 1]) for k in new}
+
+    def follow(self, part: Trace, c: Config) -> dict[int, Trials]:
+        """Return the trials that have come to an end in these `CHUNK` steps."""
+        period, over = c.physics.control_period, {}
+        for place, course in list(self.courses.items()):
+            course.parts.append(jax.tree.map(lambda x, k=place: x[:, k : k + 1], part))
+            trace = jax.tree.map(lambda *x: np.concatenate(x), *course.parts)
+            steps = len(trace.progress)
+            first = np.minimum(*_ends(trace, course.speed, period))
+            if first[0] < steps or steps * period >= c.episode.length:
+                over[course.trial] = judged(trace, course.speed, period)
+                del self.courses[place]
+        return over
+
+
+def _is_in_phase(c: Config, clock: int) -> bool:
+    """Return whether a trial may begin: whether frames come from now on as they do at first."""
+    period = c.physics.control_period
+    following = 1 + np.arange(round(c.episode.length / period))
+    first, now = (depth.is_due(k + following, c.camera, period) for k in (0, clock))
+    return c.network.variant == "blind" or bool(jnp.all(first == now))
 
 
 def _ends(
@@ -158,8 +230,7 @@ def _follow(train: ppo.TrainState, world: World, robots: Robots) -> tuple[Robots
     return rollout.advance(world, robots, memory, policy.mean[0])
 
 
-@jax.jit
-def _begin(
+def _started(
     world: World, key: PRNGKeyArray, number: Int[Array, " E"],
     kind: Int[Array, " E"], level: Int[Array, " E"],
 ) -> Robots:  # fmt: skip
@@ -169,13 +240,56 @@ def _begin(
     return rollout.placed(world, state, split[:, 1])
 
 
-@jax.jit
-def _steps(world: World, walker: Walker, robots: Robots) -> tuple[Robots, Trace]:
+_begin = jax.jit(_started)
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _begin_on(
+    world: World, key: PRNGKeyArray, number: Int[Array, " E"],
+    kind: Int[Array, " E"], level: Int[Array, " E"], mesh: Mesh,
+) -> Robots:  # fmt: skip
+    """Do the same on the devices of the mesh."""
+    robots, each = _partition(world.config), P(AXIS)
+    start = jax.shard_map(
+        _started, mesh=mesh, in_specs=(P(), P(), each, each, each), out_specs=robots,
+        check_vma=False,
+    )  # fmt: skip
+    return start(world, key, number, kind, level)
+
+
+@functools.partial(jax.jit, static_argnames="c")
+def _replaced(robots: Robots, begun: Robots, is_new: Bool[Array, " E"], c: Config) -> Robots:
+    """Return the robots, in place of some those that begin; the cameras' clock goes on."""
+
+    def chosen(spec: P, old: Array, new: Array) -> Array:
+        if not spec:
+            return old
+        axes = [k for k in range(old.ndim) if k != len(spec) - 1]
+        return jnp.where(jnp.expand_dims(is_new, axes), new, old)
+
+    of = lambda spec, old, new: jax.tree.map(functools.partial(chosen, spec), old, new)
+    return jax.tree.map(of, _partition(c), robots, begun, is_leaf=lambda x: isinstance(x, P))
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def _steps(world: World, walker: Walker, robots: Robots, mesh: Mesh) -> tuple[Robots, Trace]:
     """Advance by `CHUNK` control steps."""
 
-    def step(robots: Robots, _: None) -> tuple[Robots, Trace]:
-        robots, outcome = walker(world, robots)
-        m = outcome.measures
-        return robots, Trace(outcome.ending, m.progress, m.forward_speed)
+    def advance(world: World, walker: Walker, robots: Robots) -> tuple[Robots, Trace]:
+        def step(robots: Robots, _: None) -> tuple[Robots, Trace]:
+            robots, outcome = walker(world, robots)
+            m = outcome.measures
+            return robots, Trace(outcome.ending, m.progress, m.forward_speed)
 
-    return jax.lax.scan(step, robots, None, length=CHUNK)
+        return jax.lax.scan(step, robots, None, length=CHUNK)
+
+    place = _partition(world.config)
+    shared = jax.shard_map(
+        advance, mesh=mesh, in_specs=(P(), P(), place), out_specs=(place, P(None, AXIS)),
+        check_vma=False,
+    )  # fmt: skip
+    return shared(world, walker, robots)
+
+
+def _partition(c: Config) -> Robots:
+    return rollout.partition(AXIS, c.network.variant)

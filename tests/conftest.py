@@ -1,5 +1,6 @@
 """What every test runs under: the CPU, no display, and a cache of compiled code."""
 
+import collections
 import os
 import sys
 import tempfile
@@ -9,6 +10,11 @@ from pathlib import Path
 # Before the first import of jax or mujoco: both read these once.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
+# Most of the suite's time is compilation, and unoptimised code comes in a third of it.
+os.environ["XLA_FLAGS"] = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    + os.environ.get("XLA_FLAGS", "")  # the last one counts
+)
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -27,6 +33,12 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files of the most slow tests: so no worker is left with one at the end."""
+    slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 # The package is imported inside of these: jaxtyping checks what is imported after it is set up.

@@ -1,6 +1,7 @@
 """The command line of training: what it refuses, what it writes, and that it resumes exactly."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,14 @@ BUNDLED = str(exported.bundled())
 
 def run(folder: Path, *more: str) -> None:
     train.main([*TINY, "--run-dir", str(folder), *more])
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run that has come to its end; who changes it takes a copy."""
+    folder = tmp_path_factory.mktemp("runs") / "first"
+    run(folder)
+    return folder
 
 
 def state_of(folder: Path) -> list[np.ndarray]:
@@ -111,10 +120,9 @@ def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, vari
 
 
 @pytest.mark.slow
-def test_a_run_begins_as_a_policy_whose_critic_is_gone(tmp_path: Path):
-    run(tmp_path / "first")
-    world = runs.world_of(runs.read_config(tmp_path / "first"))
-    exported.write(runs.load_policy(tmp_path / "first", world), world, tmp_path / "policy")
+def test_a_run_begins_as_a_policy_whose_critic_is_gone(first: Path, tmp_path: Path):
+    world = runs.world_of(runs.read_config(first))
+    exported.write(runs.load_policy(first, world), world, tmp_path / "policy")
     policy = exported.read(tmp_path / "policy")
     run(tmp_path / "second", "--init", str(tmp_path / "policy"), "--iterations", "1")
     assert runs.read_config(tmp_path / "second").ppo.critic_first == 200
@@ -129,14 +137,13 @@ def test_a_run_begins_as_a_policy_whose_critic_is_gone(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_run_begins_as_another_run_with_all_that_it_learned(tmp_path: Path):
-    run(tmp_path / "first")
-    run(tmp_path / "second", "--init", str(tmp_path / "first"), "--iterations", "1")
+def test_a_run_begins_as_another_run_with_all_that_it_learned(first: Path, tmp_path: Path):
+    run(tmp_path / "second", "--init", str(first), "--iterations", "1")
     assert runs.read_config(tmp_path / "second").ppo.critic_first == 0
     log = [json.loads(line) for line in (tmp_path / "second" / "log.jsonl").open()]
     assert log[0]["iteration"] == 1
-    world = runs.world_of(runs.read_config(tmp_path / "first"))
-    before, after = (runs.load_policy(tmp_path / n, world).train for n in ("first", "second"))
+    world = runs.world_of(runs.read_config(first))
+    before, after = (runs.load_policy(n, world).train for n in (first, tmp_path / "second"))
     # 2 iterations of 8 x 24 samples, then one more
     assert int(before.statistics.critic_obs.count) == 384
     assert int(after.statistics.critic_obs.count) == 576
@@ -147,9 +154,9 @@ def test_a_run_begins_as_another_run_with_all_that_it_learned(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_run_goes_on_with_another_number_of_robots_and_keeps_what_it_learned(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    run(tmp_path / "run")
+    shutil.copytree(first, tmp_path / "run")
     run(tmp_path / "run", "--iterations", "3", "--num-envs", "4", "--resume")
     assert "num_envs changes from 8 to 4" in capsys.readouterr().out
     with Checkpoints(tmp_path / "run" / "checkpoints") as steps:
@@ -191,10 +198,9 @@ def test_robots_that_cannot_be_shared_out_are_refused(
 
 
 @pytest.mark.slow
-def test_a_run_is_not_overwritten_by_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    run(tmp_path / "run")
+def test_a_run_is_not_overwritten_by_another(first: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as end:
-        run(tmp_path / "run")
+        run(first)
     assert end.value.code == 2 and "add --resume" in capsys.readouterr().err
 
 

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from random_policy import SMALL
+from sample import assert_equal, one
 
 from cref_jax import config, evaluation, rollout, table, trials
 from cref_jax.config import Config
@@ -35,19 +37,6 @@ def world(physics):
     return evaluation.crossing_world(C, physics, "flat", 0.0)
 
 
-def walker(carry):
-    """Return what first moves the robots' bases, then steps them with no action."""
-
-    def step(world, robots):
-        body = robots.env.body
-        state = robots.env.replace(body=carry(robots.env, body))
-        return rollout.advance(
-            world, robots.replace(env=state), robots.memory, jnp.zeros_like(state.action)
-        )
-
-    return jax.tree_util.Partial(step)
-
-
 def held(env, body, x, z):
     """Return the body upright and still at x, z."""
     qpos = body.qpos.at[:, 0].set(x).at[:, 1].set(0.0).at[:, 2].set(z)
@@ -55,24 +44,44 @@ def held(env, body, x, z):
     return body._replace(qpos=qpos, qvel=jnp.zeros_like(body.qvel))
 
 
-carried = walker(
-    lambda env, body: held(env, body, body.qpos[:, 0] + env.command[:, 0] * PERIOD, HIGH)
-)
-stands = walker(lambda env, body: held(env, body, env.start[:, 0], HIGH))
-falls = walker(
-    lambda env, body: body._replace(
-        qpos=body.qpos.at[:, 3:7].set(jnp.array([0.5, 0.5, 0.5, 0.5])).at[:, 2].set(HIGH)
-    )
-)
-blows_up = walker(
-    lambda env, body: held(env, body, env.start[:, 0] + 3.5, HIGH)._replace(
-        qvel=jnp.full_like(body.qvel, jnp.inf)
-    )
+def along(env, body):
+    return held(env, body, body.qpos[:, 0] + env.command[:, 0] * PERIOD, HIGH)
+
+
+def still(env, body):
+    return held(env, body, env.start[:, 0], HIGH)
+
+
+def lying(env, body):
+    qpos = body.qpos.at[:, 3:7].set(jnp.array([0.5, 0.5, 0.5, 0.5])).at[:, 2].set(HIGH)
+    return body._replace(qpos=qpos)
+
+
+def bursting(env, body):
+    beyond = held(env, body, env.start[:, 0] + 3.5, HIGH)
+    return beyond._replace(qvel=jnp.full_like(body.qvel, jnp.inf))
+
+
+def step(which, world, robots):
+    """Move the robots' bases, then step them with no action."""
+    env = robots.env
+    body = jax.lax.switch(which, (along, still, lying, bursting), env, env.body)
+    moved = robots.replace(env=env.replace(body=body))
+    return rollout.advance(world, moved, robots.memory, jnp.zeros_like(env.action))
+
+
+# which of them it is, is a number: so they share one compiled program
+carried, stands, falls, blows_up = (
+    jax.tree_util.Partial(step, jnp.int32(which)) for which in range(4)
 )
 
 
-def run(world, walker, count=4, block=4, seed=0):
-    return trials.run(world, walker, *evaluation.crossing_lanes(count), seed, block)
+def asked(count):
+    return trials.Asked(np.arange(count), *evaluation.crossing_lanes(count))
+
+
+def run(world, walker, count=4, block=3, seed=0):
+    return trials.run(world, walker, asked(count), seed, block)
 
 
 def test_who_is_carried_along_the_lane_always_succeeds(world):
@@ -101,16 +110,64 @@ def test_who_blows_up_beyond_the_finish_has_failed(world):
 
 
 def test_a_trial_does_not_depend_on_how_many_there_are(world):
-    few, many = (run(world, carried, count, block=3) for count in (2, 5))
+    few, many = (run(world, carried, count) for count in (2, 8))
     for a, b in zip(few, many, strict=True):
         np.testing.assert_array_equal(a, b[:2])
-    assert len(set(many.speed.tolist())) == 5  # each has its own command
-    assert not np.array_equal(few.speed, run(world, carried, 2, block=3, seed=1).speed)
+    assert len(set(many.speed.tolist())) == 8  # each has its own command
+    assert not np.array_equal(few.speed, run(world, carried, 2, seed=1).speed)
+    # two devices of three places: the last two begin where others have come to their ends
+    last = trials.Asked(*(x[6:] for x in asked(8)))
+    for a, b in zip(trials.run(world, carried, last, 0, 3), many, strict=True):
+        np.testing.assert_array_equal(a, b[6:])
+
+
+def test_where_one_has_come_to_its_end_the_next_begins():
+    places = trials._Places(np.arange(8), 3)
+    # the numbers 0, 3, 6 have place 0 of a block, 1, 4, 7 place 1, and 2, 5 place 2
+    assert places.blocks == jax.device_count() == 2
+    assert places.filled().tolist() == [0, 1, 2, 3, 4, 5]
+    assert places.trial.tolist() == [0, 1, 2, 3, 4, 5]
+    places.begin(np.arange(6), np.full(6, 0.5, np.float32))
+    assert places.filled().size == 0
+    seen = trace(trials.CHUNK, robots=6, finished=20)
+    flags = seen.ending.finished & (np.arange(6) == 4)
+    over = places.follow(seen._replace(ending=seen.ending._replace(finished=flags)), C)
+    assert list(over) == [4] and over[4].seconds == pytest.approx(21 * PERIOD)
+    assert places.filled().tolist() == [4] and places.trial.tolist() == [0, 1, 2, 3, 7, 5]
+
+
+def test_a_trial_begins_when_frames_come_as_at_first():
+    # 20 Hz at 50 Hz: the frames' pattern comes round every 5 steps
+    c = config.override(C, {"network": {"variant": "full"}})
+    assert [trials._is_in_phase(c, k) for k in (0, 3, 5, 48, trials.CHUNK)] == [
+        True, False, True, False, True,
+    ]  # fmt: skip
+    assert trials._is_in_phase(C, 3), "a blind policy has no frames"
+
+
+def test_a_robot_begins_among_others_that_go_on(physics):
+    c = dataclasses.replace(C, network=SMALL)
+    world = evaluation.crossing_world(c, physics, "flat", 0.0)
+    old, new = (
+        trials.begin(world, seed, np.arange(2), *evaluation.crossing_lanes(2)) for seed in (0, 1)
+    )
+    old = old.replace(feed=old.feed.replace(clock=jnp.int32(50), fresh=jnp.array(True)))
+    memory = jax.tree.map(jnp.ones_like, old.memory)
+    old = old.replace(memory=memory, begins=jnp.zeros(2, bool))
+    found = trials._replaced(old, new, np.array([False, True]), c)
+    for k, whence in ((0, old), (1, new)):
+        for name in ("env", "observation", "begins"):
+            assert_equal(one(getattr(found, name), k), one(getattr(whence, name), k))
+        assert_equal(one(found.memory.carry, k), one(whence.memory.carry, k))
+        of = lambda robots, k=k: jax.tree.map(lambda x: x[:, k], robots.memory.features)
+        assert_equal(of(found), of(whence))
+        assert_equal(found.feed.frame[k], whence.feed.frame[k])
+    assert int(found.feed.clock) == 50 and bool(found.feed.fresh), "the cameras go on"
 
 
 def test_the_ends_are_told_as_they_come(world):
     told = []
-    trials.run(world, carried, *evaluation.crossing_lanes(5), 0, 3, told.append)
+    trials.run(world, carried, asked(5), 0, 3, told.append)
     assert sum(told) == 5 and max(told) < 5
 
 
