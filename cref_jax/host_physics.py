@@ -3,13 +3,12 @@
 MuJoCo C steps several times as many robots a second on a CPU as MJX does. The call is pure: all of
 a robot's state goes in and comes out, so that a run can be resumed bit for bit and an environment
 means the same alone as in a batch. A program calls an engine by its number, which comes from the
-order in which a process makes its engines: so a program in the cache fits the next process, too.
+model: so a program in the cache fits every engine of that model, in this process and in the next.
 """
 
 import collections
 import contextlib
-import itertools
-import weakref
+import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -23,8 +22,7 @@ from mujoco.batch import Batch
 from cref_jax import host_call, processes
 
 _TARGET = "cref_jax_mujoco_substep"
-_NUMBERS = itertools.count()
-_ENGINES: "weakref.WeakValueDictionary[int, HostEngine]" = weakref.WeakValueDictionary()
+_ENGINES: "dict[int, HostEngine]" = {}  # the first one of each number, which steps for all
 
 
 class Dynamics(NamedTuple):
@@ -54,8 +52,8 @@ class HostEngine:
         self._model = model
         self._trunk = trunk
         self._threads = threads or processes.cores()
-        self._number = next(_NUMBERS)
-        _ENGINES[self._number] = self
+        self._number = _number(model, trunk, self._threads)
+        _ENGINES.setdefault(self._number, self)
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
 
     def substep(
@@ -107,6 +105,13 @@ class HostEngine:
             found = _Simulations(self._model, self._trunk, count, min(self._threads, count))
         yield found
         idle.append(found)
+
+
+def _number(model: mujoco.MjModel, trunk: int, threads: int) -> int:
+    """Return a number that only engines of the same model and threads have."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return zlib.crc32(content, zlib.crc32(b"%d %d" % (trunk, threads))) >> 1  # fits an int32
 
 
 def _substep(arguments: list[np.ndarray], results: list[np.ndarray]) -> None:
