@@ -27,6 +27,6 @@ def apart(function: Callable[P, R]) -> Callable[P, R]:
     def called(*args: P.args, **kwargs: P.kwargs) -> R:
         if jax.default_backend() != "cpu":
             return function(*args, **kwargs)
-        return xla_metadata_call(function, inlineable="false")(*args, **kwargs)
+        return xla_metadata_call(inlineable="false")(function)(*args, **kwargs)
 
     return called

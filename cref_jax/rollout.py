@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, network, ppo, readout
+from cref_jax import config, depth, env, episode, kernels, network, ppo, readout
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
@@ -198,17 +198,18 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pix
     for flag in (True, False):
         some = np.flatnonzero(is_profile == flag)
         if some.size:
-            look = functools.partial(env.depth_image, is_profile=flag)
             part = jax.tree.map(lambda x, some=some: x[some], state)
-            images.append(jax.vmap(look, in_axes=(None, 0))(world, part).astype(jnp.float16))
+            look = kernels.apart(functools.partial(_images, is_profile=flag))
+            images.append(look(world, part))
             robots.append(some)
-    # always, but XLA does not know: it stores what a choice gives. Else it would render each pixel
-    # where it is put in order below, one by one
-    images = jax.lax.cond(
-        state.step[0] >= 0, lambda: images, lambda: jax.tree.map(jnp.zeros_like, images)
-    )
     image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
     return network.in_patches(world.config.network, image)
+
+
+def _images(world: World, state: EnvState, is_profile: bool) -> Float16[Array, "E H W"]:
+    """Return what cameras see that are all on lanes level across, or all not."""
+    look = functools.partial(env.depth_image, is_profile=is_profile)
+    return jax.vmap(look, in_axes=(None, 0))(world, state).astype(jnp.float16)
 
 
 def collect(
@@ -270,13 +271,12 @@ def _opened(c: config.Config, robots: Robots) -> _Watch:
 
 def _filed(watch: _Watch) -> _Watch:
     """Put a frame that has just come into the album; one after the last step is the next's."""
-    feed = watch.robots.feed
-    if feed is None or watch.album is None:
+    feed, album = watch.robots.feed, watch.album
+    if feed is None or album is None:
         return watch
     held = watch.held + feed.fresh.astype(jnp.int32)
-    add = lambda: watch.album.at[held].set(feed.frame, mode="drop")
-    album = jax.lax.cond(feed.fresh, add, lambda: watch.album)
-    return watch.replace(album=album, held=held)
+    add = lambda: album.at[held].set(feed.frame, mode="drop")
+    return watch.replace(album=jax.lax.cond(feed.fresh, add, lambda: album), held=held)
 
 
 def _rollout(
