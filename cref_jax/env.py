@@ -4,11 +4,12 @@ Everything here is for one robot; `jax.vmap` over the state and the key makes th
 world shared by all.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from cref_jax import config, depth, episode, foothold, geometry, observation, reward, terrain
 from cref_jax.episode import Ending, EnvState
@@ -70,7 +71,9 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
 
     A new command comes after the reward, so the reward is for the command that the policy has seen.
     """
-    return _renewed(world, *_advanced(world, state, action))
+    keys = jax.random.split(state.key, 6)
+    draws = episode.draw(world, state, keys[1], keys[2])
+    return _renewed(world, *_advanced(world, state, action, keys, draws))
 
 
 def step_all(
@@ -78,12 +81,19 @@ def step_all(
 ) -> tuple[EnvState, Outcome]:
     """Advance E robots, each as `step` does.
 
-    Under `jax.vmap` a new episode is drawn for every robot in every step; here, only in a step in
-    which an episode ends.
+    Under `jax.vmap` a push, a command and an episode are drawn for every robot in every step; here,
+    only in a step in which one of them is due.
     """
-    reached = jax.vmap(_advanced, in_axes=(None, 0, 0))(world, state, action)
+    keys = jax.vmap(lambda key: jax.random.split(key, 6))(state.key)
+    each = functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+    drawn = lambda: each(episode.draw)(world, state, keys[:, 1], keys[:, 2])
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(drawn))
+    due = jax.vmap(episode.needs_draws, in_axes=(None, 0))(world, state)
+    draws = jax.lax.cond(jnp.any(due), drawn, lambda: none)
+    advance = jax.vmap(_advanced, in_axes=(None, 0, 0, 0, 0))
+    reached = advance(world, state, action, keys, draws)
     ending = reached.outcome.ending
-    renew = lambda: jax.vmap(_renewed, in_axes=(None, 0, 0, 0))(world, *reached)
+    renew = lambda: each(_renewed)(world, *reached)
     keep = lambda: (reached.state, reached.outcome)
     return jax.lax.cond(jnp.any(ending.terminated | ending.truncated), renew, keep)
 
@@ -93,15 +103,19 @@ class _Reached(NamedTuple):
 
     state: EnvState
     outcome: Outcome
-    keys: PRNGKeyArray  # for the next level, the reset and the first observation
+    keys: Shaped[Array, "3 ..."]  # for the next level, the reset and the first observation
 
 
-def _advanced(world: World, state: EnvState, action: Float[Array, " J"]) -> _Reached:
+def _advanced(
+    world: World,
+    state: EnvState,
+    action: Float[Array, " J"],
+    keys: Shaped[Array, "6 ..."],
+    draws: episode.Draws,
+) -> _Reached:
     """Return the state that a step leads to, as if the episode went on, and what it gives."""
     c = world.config
-    keys = jax.random.split(state.key, 6)
-    key, key_push, key_command, key_see = keys[0], keys[1], keys[2], keys[5]
-    state = episode.pushed(world, state.replace(key=key), key_push)
+    state = episode.pushed(world, state.replace(key=keys[0]), draws)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
     targets = jnp.stack([_target(world, state, state.action), _target(world, state, action)])
@@ -119,15 +133,15 @@ def _advanced(world: World, state: EnvState, action: Float[Array, " J"]) -> _Rea
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
-    lived = episode.commanded(world, episode.marked(world, lived), key_command)
-    last = observe(world, lived, key_see)
+    lived = episode.commanded(world, episode.marked(world, lived), draws)
+    last = observe(world, lived, keys[5])
 
     gained = jnp.where(unstable, 0.0, gained)
     return _Reached(lived, Outcome(last, last.privileged, gained, ending, measures), keys[3:])
 
 
 def _renewed(
-    world: World, lived: EnvState, outcome: Outcome, keys: PRNGKeyArray
+    world: World, lived: EnvState, outcome: Outcome, keys: Shaped[Array, "3 ..."]
 ) -> tuple[EnvState, Outcome]:
     """Put the robot on a lane again if its episode is over, and observe it there."""
     key_level, key_reset, key_see = keys

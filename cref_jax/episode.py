@@ -109,29 +109,51 @@ def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Arra
     )
 
 
-def pushed(world: World, state: EnvState, key: PRNGKeyArray) -> EnvState:
-    """Add a sudden planar velocity to the base when a push is due."""
-    c = world.config.randomisation
-    if not c.enabled:
-        return state
-    key_push, key_next = jax.random.split(key)
-    due = state.push_left <= 0
-    shove = jax.random.uniform(key_push, (2,), minval=-c.push_velocity, maxval=c.push_velocity)
-    qvel = state.body.qvel.at[:2].add(jnp.where(due, shove, 0.0))
-    again = _drawn_steps(world.config, key_next, c.push_period)
-    return state.replace(
-        body=state.body._replace(qvel=qvel),
-        push_left=jnp.where(due, again, state.push_left - 1),
+class Draws(NamedTuple):
+    """The next push and the next command, and the control steps until those after them."""
+
+    shove: Float[Array, "2"]  # m/s
+    push_left: Int[Array, ""]
+    command: Float[Array, "3"]  # m/s, m/s, rad/s
+    command_left: Int[Array, ""]
+
+
+def needs_draws(world: World, state: EnvState) -> Bool[Array, ""]:
+    """Return whether a push or a new command is due in this step."""
+    due = state.command_left <= 0
+    return due | (state.push_left <= 0) if world.config.randomisation.enabled else due
+
+
+def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRNGKeyArray) -> Draws:
+    """Draw what `pushed` and `commanded` take where it is due."""
+    c = world.config
+    (key_shove, key_after), most = jax.random.split(key_push), c.randomisation.push_velocity
+    key_next, key_left = jax.random.split(key_command)
+    return Draws(
+        shove=jax.random.uniform(key_shove, (2,), minval=-most, maxval=most),
+        push_left=_drawn_steps(c, key_after, c.randomisation.push_period),
+        command=_drawn_command(world, key_next, state.kind),
+        command_left=_drawn_steps(c, key_left, c.command.period),
     )
 
 
-def commanded(world: World, state: EnvState, key: PRNGKeyArray) -> EnvState:
-    """Draw a new command when one is due; on a lane, steer back to its middle and direction."""
+def pushed(world: World, state: EnvState, draws: Draws) -> EnvState:
+    """Add a sudden planar velocity to the base when a push is due."""
+    if not world.config.randomisation.enabled:
+        return state
+    due = state.push_left <= 0
+    qvel = state.body.qvel.at[:2].add(jnp.where(due, draws.shove, 0.0))
+    return state.replace(
+        body=state.body._replace(qvel=qvel),
+        push_left=jnp.where(due, draws.push_left, state.push_left - 1),
+    )
+
+
+def commanded(world: World, state: EnvState, draws: Draws) -> EnvState:
+    """Take a new command when one is due; on a lane, steer back to its middle and direction."""
     c = world.config
-    key_command, key_next = jax.random.split(key)
     due = state.command_left <= 0
-    command = jnp.where(due, _drawn_command(world, key_command, state.kind), state.command)
-    again = _drawn_steps(c, key_next, c.command.period)
+    command = jnp.where(due, draws.command, state.command)
 
     heading = geometry.yaw(state.body.qpos[3:7])
     wanted = jnp.clip(-c.command.lane_gain * state.body.qpos[1], -0.5, 0.5)  # rad
@@ -142,7 +164,7 @@ def commanded(world: World, state: EnvState, key: PRNGKeyArray) -> EnvState:
     command = command.at[2].set(jnp.where(is_open, command[2], steer))
     return state.replace(
         command=command,
-        command_left=jnp.where(due, again, state.command_left - 1),
+        command_left=jnp.where(due, draws.command_left, state.command_left - 1),
         commanded=state.commanded + jnp.linalg.norm(command[:2]) * c.physics.control_period,
     )
 

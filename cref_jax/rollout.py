@@ -225,11 +225,11 @@ def collect(
     if robots.feed is not None:
         robots = robots.replace(feed=robots.feed.replace(fresh=jnp.ones((), bool)))
 
-    def step(watch: _Watch, key: PRNGKeyArray) -> tuple[_Watch, _Step]:
+    def step(watch: _Watch, noise: Float[Array, "E J"]) -> tuple[_Watch, _Step]:
         robots = watch.robots
         memory, policy = act(nets, train, robots)
         mean = policy.mean[0]
-        action = mean + jnp.exp(policy.log_std) * jax.random.normal(key, mean.shape)
+        action = mean + jnp.exp(policy.log_std) * noise
         after, outcome = advance(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
         seen = robots.feed and robots.feed.seen
@@ -239,7 +239,8 @@ def collect(
         return _filed(watch.replace(robots=after)), done
 
     keys = jax.random.split(key, c.ppo.horizon)
-    watch, steps = jax.lax.scan(step, _opened(c, robots), keys)
+    draw = lambda key: jax.random.normal(key, robots.env.action.shape)
+    watch, steps = jax.lax.scan(step, _opened(c, robots), jax.vmap(draw)(keys))
     after = watch.robots
     if after.feed is not None:
         blank = jax.tree.map(jnp.zeros_like, after.memory.features)

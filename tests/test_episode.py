@@ -96,6 +96,15 @@ def test_on_a_lane_the_command_goes_forward_and_on_open_ground_anywhere(world, r
         assert np.ptp(free[:, column]) > 0.8 * (high - low)
 
 
+def commanded(world, state, seed=0):
+    draws = episode.draw(world, state, jax.random.key(9), jax.random.key(seed))
+    return episode.commanded(world, state, draws)
+
+
+def pushed(world, state, key):
+    return episode.pushed(world, state, episode.draw(world, state, key, jax.random.key(9)))
+
+
 @pytest.mark.parametrize(
     ("y", "heading", "expected"),
     [
@@ -111,7 +120,7 @@ def test_on_a_lane_the_command_goes_forward_and_on_open_ground_anywhere(world, r
 def test_a_robot_on_a_lane_is_steered_to_its_middle(world, robots, y, heading, expected):
     state = on("gap", one(robots)).replace(command_left=jnp.int32(9))
     about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.float32(heading))
-    steered = episode.commanded(world, put(state, y=y, rotation=about_z), jax.random.key(0))
+    steered = commanded(world, put(state, y=y, rotation=about_z))
     np.testing.assert_allclose(steered.command[2], expected, atol=1e-5)
     np.testing.assert_array_equal(steered.command[:2], state.command[:2])
 
@@ -123,7 +132,7 @@ def test_whoever_obeys_the_steering_ends_in_the_middle_of_the_lane(world, robots
         x, y, heading = pose
         rotation = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
         here = put(state, x=x, y=y, rotation=rotation).replace(command_left=jnp.int32(9))
-        vx, _, rate = episode.commanded(world, here, jax.random.key(0)).command * PERIOD
+        vx, _, rate = commanded(world, here).command * PERIOD
         return (x + vx * jnp.cos(heading), y + vx * jnp.sin(heading), heading + rate), None
 
     start = (jnp.float32(0.5), jnp.float32(0.4), jnp.float32(0.9))
@@ -134,7 +143,7 @@ def test_whoever_obeys_the_steering_ends_in_the_middle_of_the_lane(world, robots
 def test_on_open_ground_the_yaw_rate_is_the_drawn_one(world, robots):
     state = on("flat", one(robots))
     state = put(state, y=0.5).replace(command=jnp.array([0.5, 0.1, 0.7]), command_left=jnp.int32(9))
-    after = episode.commanded(world, state, jax.random.key(0))
+    after = commanded(world, state)
     np.testing.assert_array_equal(after.command, state.command)
     # |(0.5, 0.1)| * 0.02 s
     np.testing.assert_allclose(after.commanded - state.commanded, 0.51 * PERIOD, rtol=1e-3)
@@ -142,9 +151,9 @@ def test_on_open_ground_the_yaw_rate_is_the_drawn_one(world, robots):
 
 def test_a_new_command_is_drawn_only_when_it_is_due(world, robots):
     state = on("gap", one(robots))
-    kept = episode.commanded(world, state.replace(command_left=jnp.int32(1)), jax.random.key(1))
+    kept = commanded(world, state.replace(command_left=jnp.int32(1)), seed=1)
     assert float(kept.command[0]) == float(state.command[0]) and int(kept.command_left) == 0
-    drawn = episode.commanded(world, kept, jax.random.key(1))
+    drawn = commanded(world, kept, seed=1)
     assert float(drawn.command[0]) != float(state.command[0])
     assert 400 <= int(drawn.command_left) <= 600  # 8 to 12 s
 
@@ -154,11 +163,11 @@ def test_a_new_command_is_drawn_only_when_it_is_due(world, robots):
 
 def test_a_push_changes_the_planar_velocity_and_only_when_due(world, robots):
     state = one(robots)
-    waits = episode.pushed(world, state.replace(push_left=jnp.int32(1)), jax.random.key(0))
+    waits = pushed(world, state.replace(push_left=jnp.int32(1)), jax.random.key(0))
     assert_equal(waits.body, state.body)
     assert int(waits.push_left) == 0
     keys = jax.random.split(jax.random.key(0), 300)
-    after = jax.vmap(lambda key: episode.pushed(world, waits, key))(keys)
+    after = jax.vmap(lambda key: pushed(world, waits, key))(keys)
     change = np.asarray(after.body.qvel - state.body.qvel)
     np.testing.assert_array_equal(change[:, 2:], 0.0)
     assert 0.95 < np.abs(change[:, :2]).max() <= C.randomisation.push_velocity + 1e-6
@@ -170,7 +179,7 @@ def test_a_push_changes_the_planar_velocity_and_only_when_due(world, robots):
 def test_nobody_is_pushed_without_randomisation(world, robots):
     calm = world.replace(config=config.override(C, {"randomisation": {"enabled": False}}))
     state = one(robots).replace(push_left=jnp.int32(0))
-    assert_equal(episode.pushed(calm, state, jax.random.key(0)), state)
+    assert_equal(pushed(calm, state, jax.random.key(0)), state)
 
 
 # The end
