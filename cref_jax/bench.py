@@ -1,7 +1,9 @@
 """Measure this machine: `python -m cref_jax.bench`.
 
 Every figure of a table comes from one run, so that they can be compared with each other. Each is
-the best of several repetitions, which disturbs less than a mean by what else the machine does.
+the best of several repetitions, which disturbs less than a mean by what else the machine does. A
+stage's share is that of the least time that its matrix products, at the rate of a large one, or its
+arrays, at the rate of a copy, would take here; that of the physics is MuJoCo's own batch.
 """
 
 import dataclasses
@@ -32,10 +34,12 @@ from cref_jax import (
     ppo,
     processes,
     rollout,
+    roofline,
     runs,
 )
 from cref_jax.config import Config
 from cref_jax.physics import EngineName, resolve_engine
+from cref_jax.roofline import Rates
 from cref_jax.world import World
 
 STEPS = 12  # control steps of one timed call
@@ -48,14 +52,14 @@ class Options:
 
     terrain: str = "mixed"
     """what the robots stand on"""
-    num_envs: int = 512
-    """robots at once"""
+    num_envs: tuple[int, ...] = (64, 256)
+    """robots at once, one column of stages for each"""
     repeats: int = 5
     """the best of so many is taken"""
     engines: tuple[EngineName, ...] = ("mujoco", "mjx")
-    """engines to compare"""
+    """engines to compare, with the last number of robots"""
     depth: bool = True
-    """compare the depth camera with NVIDIA Warp's ray-cast, too, if that is installed"""
+    """compare the depth camera with MuJoCo's ray-cast, too, and with NVIDIA Warp's if installed"""
     out: Path | None = None
     """write the figures as JSON, too"""
     debug: bool = False
@@ -69,6 +73,7 @@ class Row(NamedTuple):
     robots: int
     seconds: float  # for one control step of all robots
     compile_seconds: float
+    share: float | None = None  # of what the machine allows; None where nothing says what it does
 
 
 def main() -> None:
@@ -76,44 +81,85 @@ def main() -> None:
     options = tyro.cli(Options, prog="python -m cref_jax.bench")
     with cli.one_line_errors(options.debug):
         cli.prepare()
-        rows = measure(options)
+        rates = roofline.measure()
+        rows = measure(options, rates)
         speeds = compare_depth(options) if options.depth else []
-        show(options, rows, speeds)
+        show(options, rates, rows, speeds)
         if options.out:
-            options.out.write_text(json.dumps(as_json(options, rows, speeds), indent=2) + "\n")
+            found = as_json(options, rates, rows, speeds)
+            options.out.write_text(json.dumps(found, indent=2) + "\n")
 
 
-def measure(options: Options) -> list[Row]:
+def measure(options: Options, rates: Rates) -> list[Row]:
     """Return every stage's time."""
-    c = config.override(
-        Config(),
-        {
-            "terrain": {"name": options.terrain},
-            "run": {"num_envs": options.num_envs},
-            "ppo": {"epochs": 1},
-        },
-    )
-    config.check(c)
     rows, console = [], Console()
+    for count in options.num_envs:
+        with console.status(f"{count} robots: compiling and timing"):
+            rows += _stages(options, rates, count)
+    most = options.num_envs[-1]
     for engine in options.engines:
-        with console.status(f"engine {engine}: compiling and timing"):
-            world = runs.world_of(c, engine)
-            robots = jax.jit(rollout.start, static_argnames="num_envs")(
-                world, jax.random.key(0), options.num_envs
-            )
-            rows.append(_timed(f"environment step, {engine}", _steps, options, world, robots))
-            rows.append(_timed(f"physics, {engine}", _physics, options, world, robots))
-    with console.status("learner: compiling and timing"):
-        world = runs.world_of(c, resolve_engine("auto"))
-        state = jax.jit(learn.initial_state)(world)
-        rows.append(_timed("terrain query", _queries, options, world, state.robots))
-        rows.append(_timed("depth, 20 Hz", _frames, options, world, state.robots))
-        rows.append(_timed(FOOTHOLD, _footholds, options, world, state.robots))
-        rows.append(_timed("policy", _policy, options, world, state))
-        rows.append(_timed("update, one epoch", _update, options, world, state))
+        if engine != resolve_engine("auto"):
+            with console.status(f"engine {engine}: compiling and timing"):
+                world = runs.world_of(_config(options, most), engine)
+                rows += _engine(options, rates, engine, world, _started(world, most))
     with console.status("whole iteration: compiling and timing"):
         rows.append(_iteration(options))
     return rows
+
+
+def _stages(options: Options, rates: Rates, count: int) -> list[Row]:
+    """Return the times of the stages for so many robots."""
+    world = runs.world_of(_config(options, count), resolve_engine("auto"))
+    state = jax.jit(learn.initial_state)(world)
+    timed = functools.partial(_timed, options, rates, count)
+    return [
+        *_engine(options, rates, resolve_engine("auto"), world, state.robots),
+        timed("terrain query", _queries, world, state.robots),
+        timed("depth, 20 Hz", _frames, world, state.robots),
+        timed(FOOTHOLD, _footholds, world, state.robots),
+        timed("policy", _policy, world, state),
+        timed("update, one epoch", _update, world, state),
+    ]
+
+
+def _engine(
+    options: Options, rates: Rates, engine: EngineName, world: World, robots: rollout.Robots
+) -> list[Row]:
+    """Return the times of a step with this engine, beside MuJoCo's own batch."""
+    count = len(robots.begins)
+    timed = functools.partial(_timed, options, rates, count)
+    rows = [
+        timed(f"environment step, {engine}", _steps, world, robots)._replace(share=None),
+        timed(f"physics, {engine}", _physics, world, robots)._replace(share=None),
+    ]
+    if engine != "mujoco":
+        return rows
+    substeps, threads = world.config.physics.substeps, processes.cores()
+    alone = peers.raw_substep(
+        world.physics, robots.env.body, threads, STEPS * substeps, options.repeats
+    )
+    raw = Row("physics, MuJoCo's own batch", count, alone * substeps, 0.0)
+    return [rows[0], rows[1]._replace(share=raw.seconds / rows[1].seconds), raw]
+
+
+def _config(options: Options, count: int) -> Config:
+    changes = {
+        "terrain": {"name": options.terrain},
+        "run": {"num_envs": count},
+        "ppo": {"epochs": 1},
+    }
+    c = config.override(runs.composed(options.terrain, None, _device()), changes)
+    config.check(c)
+    return c
+
+
+def _device() -> str:
+    return "cpu" if jax.default_backend() == "cpu" else "gpu"
+
+
+def _started(world: World, count: int) -> rollout.Robots:
+    start = jax.jit(rollout.start, static_argnames="num_envs")
+    return start(world, jax.random.key(0), count)
 
 
 def compare_depth(options: Options) -> list[peers.Speed]:
@@ -124,15 +170,26 @@ def compare_depth(options: Options) -> list[peers.Speed]:
         return peers.compare(lane.tile(0, 0), c.camera, lane.is_profile[0])
 
 
-def show(options: Options, rows: list[Row], speeds: list[peers.Speed]) -> None:
+def show(options: Options, rates: Rates, rows: list[Row], speeds: list[peers.Speed]) -> None:
     """Print the tables and the ratios that the design promises."""
     table = Table(title=f"{options.terrain}, {_machine()}")
-    for column in ("stage", "robots", "ms a control step", "robot steps/s", "compiled in s"):
+    columns = (
+        "stage",
+        "robots",
+        "ms a control step",
+        "robot steps/s",
+        "of the machine",
+        "compiled in s",
+    )
+    for column in columns:
         table.add_column(column, justify="left" if column == "stage" else "right")
     for row in rows:
         times = f"{1e3 * row.seconds:.2f}", f"{row.robots / row.seconds:,.0f}"
-        table.add_row(row.stage, str(row.robots), *times, f"{row.compile_seconds:.1f}")
+        share = "" if row.share is None else f"{row.share:.0%}"
+        table.add_row(row.stage, str(row.robots), *times, share, f"{row.compile_seconds:.1f}")
+    products, memory = rates.products / 1e9, rates.memory / 1e9
     console = Console()
+    console.print(f"matrix products {products:,.0f} GFLOP/s, memory {memory:,.1f} GB/s, one device")
     console.print(table)
     for name, ratio in ratios(rows).items():
         console.print(f"{name}: {ratio:,.3g}")
@@ -147,7 +204,7 @@ def show(options: Options, rows: list[Row], speeds: list[peers.Speed]) -> None:
 
 
 def ratios(rows: list[Row]) -> dict[str, float]:
-    """Return the comparisons, as far as their stages were measured."""
+    """Return the comparisons, as far as their stages were measured, of the most robots."""
     seconds = {row.stage: row.seconds / row.robots for row in rows}
     steps = {e: seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx")}
     found = {}
@@ -161,10 +218,13 @@ def ratios(rows: list[Row]) -> dict[str, float]:
     return found
 
 
-def as_json(options: Options, rows: list[Row], speeds: list[peers.Speed]) -> dict[str, Any]:
+def as_json(
+    options: Options, rates: Rates, rows: list[Row], speeds: list[peers.Speed]
+) -> dict[str, Any]:
     """Return all figures with where they were measured."""
     return {
         "machine": _machine(),
+        "rates": rates._asdict(),
         "terrain": options.terrain,
         "rows": [row._asdict() for row in rows],
         "ratios": ratios(rows),
@@ -177,25 +237,32 @@ def _machine() -> str:
     return f"{device.device_kind} x {jax.device_count()}, {os.cpu_count()} CPU cores"
 
 
-def _timed(stage: str, make: Callable[..., Any], options: Options, *arguments: Any) -> Row:
+def _timed(
+    options: Options,
+    rates: Rates,
+    count: int,
+    stage: str,
+    make: Callable[..., Any],
+    *arguments: Any,
+) -> Row:
     """Compile a stage and return its best time for one control step."""
+    least = roofline.work_of(make, *arguments).seconds(rates)
     begun = time.perf_counter()
     program = jax.jit(make).lower(*arguments).compile()
     compiled = time.perf_counter() - begun
     run = lambda: jax.block_until_ready(program(*arguments))
     seconds = peers.shortest(run, options.repeats)
-    return Row(stage, options.num_envs, seconds / STEPS, compiled)
+    return Row(stage, count, seconds / STEPS, compiled, least / seconds)
 
 
 def _iteration(options: Options) -> Row:
     """Return the time of a whole iteration of `make train`, as it is set up for this device."""
-    device = "cpu" if jax.default_backend() == "cpu" else "gpu"
-    c = runs.composed(options.terrain, None, device)
+    c = runs.composed(options.terrain, None, _device())
     mesh = runs.mesh_of(c)
     world = runs.world_of(c, resolve_engine("auto"), max(processes.cores() // mesh.size, 1))
     state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
     begun = time.perf_counter()
-    program = learn.chunk.lower(world, state, mesh, 1).compile()
+    program = learn.chunk.lower(world, state, mesh, c.run.chunk).compile()
     compiled = time.perf_counter() - begun
     run = {"state": state}  # each call consumes the state that it is given
 
@@ -204,7 +271,7 @@ def _iteration(options: Options) -> Row:
         return jax.block_until_ready(log)
 
     seconds = peers.shortest(step, options.repeats)
-    return Row(ITERATION, c.run.num_envs, seconds / c.ppo.horizon, compiled)
+    return Row(ITERATION, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compiled)
 
 
 def _steps(world: World, robots: rollout.Robots) -> Any:

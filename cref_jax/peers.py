@@ -1,7 +1,7 @@
-"""NVIDIA Warp's ray-cast of the scene that our depth camera sees, to compare the two.
+"""What others make of the same work: ray-casts of the scene that our camera sees, and the physics.
 
-Warp is a dependency of the benchmark alone: `pip install 'cref-jax[bench]'`. On a CPU its kernels
-run on one thread.
+NVIDIA Warp is a dependency of the benchmark alone: `pip install 'cref-jax[bench]'`. On a CPU its
+kernels run on one thread, as MuJoCo's ray-cast does.
 """
 
 import importlib.util
@@ -14,11 +14,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
+from mujoco.batch import Batch
 
-from cref_jax import config, depth, scene
+from cref_jax import config, depth, robot, scene
+from cref_jax.physics import Body, Physics
+from cref_jax.stand_in import Lane
 from cref_jax.terrain import Terrain
 
 CAMERAS = 256
+RAY_CAST = 16  # of the cameras, by MuJoCo's ray-cast, which is slow
 REPEATS = 8
 HEIGHT = (1.0, 1.3)  # m, of the cameras over the ground
 TURN = 0.2  # rad, +-, yaw, pitch and roll about the mount's pose
@@ -42,17 +46,20 @@ class Speed(NamedTuple):
 
 
 def compare(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Speed]:
-    """Return the speed of our renderers and of Warp's ones, if it is installed, on one lane."""
+    """Return the speed of our renderers, MuJoCo's and, if it is installed, Warp's, on one lane."""
     position, rotation = _poses(ground, camera)
-    found, reference = [], None
-    for sweeps in (False, True) if is_profile else (False,):
-        seconds, images = _ours(ground, position, rotation, camera, sweeps)
-        reference = images if reference is None else reference
-        name = "sweep of the profile" if sweeps else "march over the columns"
-        found.append(_speed(name, seconds, "all", images, reference))
+    seconds, reference = _ours(ground, position, rotation, camera, is_profile=False)
+    found = [_speed("march over the columns", seconds, "all", reference, reference)]
+    if is_profile:
+        seconds, images = _ours(ground, position, rotation, camera, is_profile=True)
+        found.append(_speed("sweep of the profile", seconds, "all", images, reference))
+    heights, origin = scene.window(ground)
+    some = slice(0, RAY_CAST)
+    lane = Lane(heights, origin, ground.cell, np.inf)
+    seconds, images = _multi_ray(lane, position[some], rotation[some], camera)
+    found.append(_speed("mj_multiRay", seconds, "1", images, reference[some]))
     if importlib.util.find_spec("warp") is None:
         return found
-    heights, origin = scene.window(ground)
     meshes = {
         "boxes": box_mesh(heights, origin, ground.cell),
         "grid": grid_mesh(heights, origin, ground.cell),
@@ -144,6 +151,67 @@ def _ours(
     return shortest(draw_all, REPEATS), np.asarray(draw_all())
 
 
+def raw_substep(physics: Physics, bodies: Body, threads: int, steps: int, repeats: int) -> float:
+    """Return the time of a substep of all robots in MuJoCo's own batch, s.
+
+    They stand on level planes: without a terrain, without copies, and without JAX.
+    """
+    count = len(bodies.qpos)
+    batch, model = Batch(physics.model, count, threads), physics.model
+    views = {name: batch.bind(name) for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+    targets = np.asarray(physics.robot.rest_pose)
+    planes = batch.bind("mocap_pos")
+    best = float("inf")
+    for _ in range(repeats + 1):
+        for view, value in zip(views.values(), (*bodies, targets), strict=True):
+            view[:] = value
+        planes[:, : model.nmocap] = 0.0
+        begun = time.perf_counter()
+        for _ in range(steps):
+            batch.step()
+        best = min(best, (time.perf_counter() - begun) / steps)
+    return best
+
+
+def _multi_ray(
+    lane: Lane,
+    position: Float[np.ndarray, "E 3"],
+    rotation: Float[np.ndarray, "E 3 3"],
+    camera: config.Camera,
+) -> tuple[float, Float[np.ndarray, "E H W"]]:
+    """Return the time of all images, s, and the images."""
+    spec = mujoco.MjSpec()
+    lane.add_to(spec, robot.FRICTION)
+    model = spec.compile()
+    state = mujoco.MjData(model)
+    mujoco.mj_forward(model, state)
+    rays = _rays(camera)
+    long = np.linalg.norm(rays, axis=1)
+    unit, count = rays / long[:, None], len(rays)
+    images = np.empty((len(position), count))
+
+    def cast() -> None:
+        found, distance = np.zeros(count, np.int32), np.zeros(count)
+        for k in range(len(position)):
+            world = (unit @ rotation[k].T.astype(float)).ravel()
+            mujoco.mj_multiRay(
+                model, state, position[k].astype(float), world, None, True, -1, found, distance,
+                None, count, 1e3,
+            )  # fmt: skip
+            images[k] = np.where(distance < 0.0, np.inf, distance / long)
+
+    seconds = shortest(cast, 1)
+    return seconds, np.minimum(images, camera.d_max).reshape(-1, *camera.shape)
+
+
+def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
+    """Return the directions (x, y, 1) of the pixels, row by row."""
+    (h, w), (vertical, horizontal) = camera.shape, camera.view
+    tangent = lambda n, view: (2 * (np.arange(n) + 0.5) / n - 1) * np.tan(np.radians(view / 2))
+    x, y = np.meshgrid(tangent(w, horizontal), tangent(h, vertical))
+    return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+
+
 def _warp(
     mesh: Mesh,
     position: Float[np.ndarray, "E 3"],
@@ -168,10 +236,7 @@ def _warp(
         hit = wp.mesh_query_ray(mesh, position[e], rotation[e] * rays[k], farthest)
         image[e, k] = wp.where(hit.result, hit.t, farthest)
 
-    (h, w), (vertical, horizontal) = camera.shape, camera.view
-    tangent = lambda n, view: (2 * (np.arange(n) + 0.5) / n - 1) * np.tan(np.radians(view / 2))
-    x, y = np.meshgrid(tangent(w, horizontal), tangent(h, vertical))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays, (h, w) = _rays(camera), camera.shape
     array = lambda values, dtype: wp.array(values, dtype=dtype, device="cpu")
     solid = wp.Mesh(array(mesh.points, wp.vec3), array(mesh.triangles.ravel(), wp.int32))
     image = wp.zeros((len(position), h * w), dtype=float, device="cpu")

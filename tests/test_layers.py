@@ -34,9 +34,9 @@ LAYERS = [
     {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "peers", "stand_in", "table", "run_page", "ood"},
-    {"exported", "ood_verdict", "transfer"},
-    {"watch", "ood_suite"},
+    {"runs", "stand_in", "table", "run_page", "ood"},
+    {"exported", "ood_verdict", "transfer", "peers"},
+    {"watch", "ood_suite", "roofline"},
     {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},
 ]
 RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
