@@ -10,11 +10,6 @@ from pathlib import Path
 # Before the first import of jax or mujoco: both read these once.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
-# Most of the suite's time is compilation, and unoptimised code comes in a third of it.
-os.environ["XLA_FLAGS"] = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
-    + os.environ.get("XLA_FLAGS", "")  # the last one counts
-)
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
