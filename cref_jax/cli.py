@@ -16,6 +16,7 @@ from cref_jax.checkpoint import CheckpointError
 from cref_jax.config import ConfigError
 
 _MMAP_MAX, _TRIM_THRESHOLD = -4, -1  # parameters of mallopt, malloc.h
+_THREADS = 8  # of XLA at least; assumed: twice what two devices' programs may hold at a time
 
 
 class TrainingError(RuntimeError):
@@ -63,6 +64,7 @@ def prepare() -> None:
     _use_wide_registers()
     _use_compile_cache()
     _use_every_core()
+    _spare_threads()
     _keep_memory()
 
 
@@ -100,6 +102,15 @@ def _use_every_core() -> None:
     if not chosen:
         with contextlib.suppress(RuntimeError):  # JAX is in use already
             jax.config.update("jax_num_cpu_devices", processes.cores())
+
+
+def _spare_threads() -> None:
+    """Give XLA threads to spare on a CPU of few cores.
+
+    A batched Cholesky, of which engine `mjx` has many, holds a thread while others do its work; as
+    many at once as there are threads wait for ever.
+    """
+    os.environ.setdefault("NPROC", str(max(processes.cores(), _THREADS)))
 
 
 def _keep_memory() -> None:

@@ -10,6 +10,9 @@ from pathlib import Path
 # Before the first import of jax or mujoco: both read these once.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
+# XLA's threads: a Cholesky of MJX's holds one while others do its work, and two of them would wait
+# for ever on two threads
+os.environ.setdefault("NPROC", "8")
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
