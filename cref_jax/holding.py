@@ -35,10 +35,11 @@ def holding(frame: Int[Array, " T"], frames: int, slots: int) -> Holding:
     """
     steps = frame.size
     holds = frame == jnp.arange(frames)[:, None]
-    step = jnp.argmax(holds, axis=1)[:, None] + jnp.arange(slots)
-    taken = (step < steps) & jnp.take_along_axis(holds, jnp.minimum(step, steps - 1), axis=1)
     first = jnp.argmax(holds, axis=1)
-    return Holding(frame, jnp.arange(steps) - first[frame], jnp.minimum(step, steps - 1), taken)
+    step = first[:, None] + jnp.arange(slots)
+    within = jnp.minimum(step, steps - 1)
+    taken = (step < steps) & jnp.take_along_axis(holds, within, axis=1)
+    return Holding(frame, jnp.arange(steps) - first[frame], within, taken)
 
 
 @jax.custom_vjp
