@@ -56,8 +56,9 @@ class Options:
     """robots at once, one column of stages for each"""
     repeats: int = 5
     """the best of so many is taken"""
-    engines: tuple[EngineName, ...] = ("mujoco", "mjx")
-    """engines to compare, with the last number of robots"""
+    engines: tuple[EngineName, ...] = ()
+    """engines to compare with this machine's own, with the last number of robots; with mjx on a
+    CPU, XLA gets threads to spare, which slows down everything else here"""
     depth: bool = True
     """compare the depth camera with MuJoCo's ray-cast, too, and with NVIDIA Warp's if installed"""
     out: Path | None = None
@@ -80,7 +81,7 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.bench")
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        cli.prepare(options.engines)
         rates = roofline.measure()
         rows = measure(options, rates)
         speeds = compare_depth(options) if options.depth else []

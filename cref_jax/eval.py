@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        cli.prepare([options.engine])
         subjects = [_subject(path, options) for path in _sources(options)]
         source = subjects[0].source
         out = options.out or (source if exported.is_run(source) else Path())

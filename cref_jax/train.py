@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with cli.one_line_errors(debug="--debug" in arguments):
-        cli.prepare()
+        cli.prepare([_options(arguments).engine])
         options, c = parse(arguments)
         if options.print_config:
             print(json.dumps(dataclasses.asdict(c), indent=2))
@@ -95,8 +95,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     Raises:
         ConfigError: a value that cannot be used, an unknown terrain or experiment.
     """
-    asked = [a for a in arguments if a not in ("-h", "--help")]
-    options, _ = tyro.cli(Options, args=asked, return_unknown_args=True)
+    options = _options(arguments)
     options = dataclasses.replace(options, device=select_device(options.device))
     if options.resume:
         run = options.run_dir or runs.newest()
@@ -111,6 +110,13 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         c = _with_init(c, command.options)
     config.check(c)
     return dataclasses.replace(command.options, device=options.device), c
+
+
+def _options(arguments: list[str]) -> Options:
+    """Parse the options alone: what they say decides what the settings begin with."""
+    asked = [a for a in arguments if a not in ("-h", "--help")]
+    options, _ = tyro.cli(Options, args=asked, return_unknown_args=True)
+    return options
 
 
 def select_device(device: Device) -> Literal["cpu", "gpu"]:

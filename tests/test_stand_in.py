@@ -75,10 +75,11 @@ def test_the_operator_steers_as_in_training():
     state = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
     state = state.replace(command_left=jnp.int32(1000))
     command = jax.jit(episode.commanded)
+    draws = jax.jit(episode.draw)(world, state, jax.random.key(0), jax.random.key(1))
     for y, angle in [(0.0, 0.0), (0.8, 0.3), (-3.0, 0.5), (0.2, 3.0), (0.0, -3.1)]:
         rotation = jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
         there = put(state, y=y, rotation=rotation)
-        expected = command(world, there, jax.random.key(0)).command
+        expected = command(world, there, draws).command
         found = stand_in.steered(C.command, float(state.command[0]), np.asarray(there.body.qpos))
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
