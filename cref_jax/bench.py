@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cref_jax import (
+    brax_peer,
     cli,
     config,
     depth,
@@ -44,6 +45,7 @@ from cref_jax.world import World
 
 STEPS = 12  # control steps of one timed call
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
+BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the same"
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class Options:
     engines: tuple[EngineName, ...] = ()
     """engines to compare with this machine's own, with the last number of robots; with mjx on a
     CPU, XLA gets threads to spare, which slows down everything else here"""
+    brax: bool = True
+    """compare brax's PPO on flat ground, too, without a camera"""
     depth: bool = True
     """compare the depth camera with MuJoCo's ray-cast, too, and with NVIDIA Warp's if installed"""
     out: Path | None = None
@@ -104,8 +108,18 @@ def measure(options: Options, rates: Rates) -> list[Row]:
                 world = runs.world_of(_config(options, most), engine)
                 rows += _engine(options, rates, engine, world, _started(world, most))
     with console.status("whole iteration: compiling and timing"):
-        rows.append(_iteration(options))
+        rows.append(_iteration(options, ITERATION, _preset(options.terrain)))
+    if options.brax:
+        with console.status("brax's PPO: compiling and timing"):
+            rows += _learners(options)
     return rows
+
+
+def _learners(options: Options) -> list[Row]:
+    """Return the time of an iteration of ours and of brax's PPO, on flat ground and blind."""
+    c = _preset("flat", {"network": {"variant": "blind"}})
+    seconds = c.run.num_envs / brax_peer.samples_per_second(c)
+    return [_iteration(options, BLIND, c), Row(BRAX, c.run.num_envs, seconds, 0.0)]
 
 
 def _stages(options: Options, rates: Rates, count: int) -> list[Row]:
@@ -144,18 +158,19 @@ def _engine(
 
 
 def _config(options: Options, count: int) -> Config:
-    changes = {
-        "terrain": {"name": options.terrain},
-        "run": {"num_envs": count},
-        "ppo": {"epochs": 1},
-    }
-    c = config.override(runs.composed(options.terrain, None, _device()), changes)
+    return _preset(options.terrain, {"run": {"num_envs": count}, "ppo": {"epochs": 1}})
+
+
+def _preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
+    """Return the settings of `make train` on this device, with these changes.
+
+    Raises:
+        ConfigError: the terrain or a setting cannot be used.
+    """
+    device = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    c = config.override(runs.composed(terrain, None, device), changes or {})
     config.check(c)
     return c
-
-
-def _device() -> str:
-    return "cpu" if jax.default_backend() == "cpu" else "gpu"
 
 
 def _started(world: World, count: int) -> rollout.Robots:
@@ -216,6 +231,8 @@ def ratios(rows: list[Row]) -> dict[str, float]:
     if fastest:
         found["terrain query, share of an environment step"] = seconds["terrain query"] / fastest
     found["foothold reward, share of an iteration"] = seconds[FOOTHOLD] / seconds[ITERATION]
+    if BRAX in seconds:
+        found["our PPO over brax's, samples/s"] = seconds[BRAX] / seconds[BLIND]
     return found
 
 
@@ -258,9 +275,8 @@ def _timed(
     return Row(stage, count, seconds / STEPS, compiled, least / seconds)
 
 
-def _iteration(options: Options) -> Row:
-    """Return the time of a whole iteration of `make train`, as it is set up for this device."""
-    c = runs.composed(options.terrain, None, _device())
+def _iteration(options: Options, stage: str, c: Config) -> Row:
+    """Return the time of a whole iteration of `make train` with these settings."""
     mesh = runs.mesh_of(c)
     world = runs.world_of(c, resolve_engine("auto"), max(processes.cores() // mesh.size, 1))
     state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
@@ -274,7 +290,7 @@ def _iteration(options: Options) -> Row:
         return jax.block_until_ready(log)
 
     seconds = peers.shortest(step, options.repeats)
-    return Row(ITERATION, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compiled)
+    return Row(stage, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compiled)
 
 
 def _steps(world: World, robots: rollout.Robots) -> Any:

@@ -13,6 +13,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
 # XLA's threads: a Cholesky of MJX's holds one while others do its work, and two of them would wait
 # for ever on two threads
 os.environ.setdefault("NPROC", "8")
+# Most of the suite's time is compilation, and a quarter of that is optimisation.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 if sys.platform == "linux" and not os.environ.get("DISPLAY") and find_library("EGL"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -22,7 +24,7 @@ import pytest
 
 def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_num_cpu_devices", 2)  # what is shared among devices, is among these
-    # Most of the suite's time is compilation. The cache is the user's own: it holds machine code.
+    # The cache is the user's own: it holds machine code.
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cref_jax" / "tests"
     try:
         cache.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -227,10 +227,10 @@ def random_walk(world, state, steps: int):
 
 
 @pytest.mark.slow
-def test_512_robots_survive_10_s_of_random_actions(world, resets):
-    sound, ending = random_walk(world, resets, steps=500)
+def test_256_robots_survive_10_s_of_random_actions(world, resets):
+    sound, ending = random_walk(world, one(resets, np.arange(256)), steps=500)
     assert sound.all() and not ending.unstable.any()
-    assert ending.terminated.sum() > 512  # they have fallen, and gone on
+    assert ending.terminated.sum() > 256  # they have fallen, and gone on
 
 
 @pytest.mark.slow

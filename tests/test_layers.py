@@ -35,7 +35,7 @@ LAYERS = [
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"runs", "stand_in", "table", "run_page", "ood"},
-    {"exported", "ood_verdict", "transfer", "peers"},
+    {"exported", "ood_verdict", "transfer", "peers", "brax_peer"},
     {"watch", "ood_suite", "roofline"},
     {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},
 ]

@@ -1,0 +1,43 @@
+"""brax's PPO on our environment: what a user would have who took that learner instead of ours."""
+
+import functools
+
+from brax.training.agents.ppo import networks, train
+
+from cref_jax import config
+from cref_jax.brax_env import BraxEnv, mend_brax, wrap
+
+ITERATIONS = 4  # of each of two parts; the first part compiles
+
+
+def samples_per_second(c: config.Config) -> float:
+    """Time brax's PPO with our number of robots, horizon, epochs and minibatches.
+
+    Its networks have the hidden layers of our action head and critic and no memory, so that its
+    update is a lighter one. The configuration has to be that of a blind policy.
+    """
+    mend_brax()
+    seen: list[float] = []
+    robots = BraxEnv(c)
+    train.train(
+        robots,
+        num_timesteps=2 * ITERATIONS * c.run.num_envs * c.ppo.horizon,
+        num_envs=c.run.num_envs,
+        episode_length=robots.episode_length,
+        wrap_env_fn=wrap,
+        unroll_length=c.ppo.horizon,
+        batch_size=c.run.num_envs // c.ppo.minibatches,
+        num_minibatches=c.ppo.minibatches,
+        num_updates_per_batch=c.ppo.epochs,
+        normalize_observations=True,
+        num_evals=3,
+        run_evals=False,
+        network_factory=functools.partial(
+            networks.make_ppo_networks,
+            policy_hidden_layer_sizes=tuple(c.network.actor),
+            value_hidden_layer_sizes=tuple(c.network.critic),
+            value_obs_key="privileged_state",
+        ),
+        progress_fn=lambda _, metrics: seen.append(float(metrics.get("training/sps", 0.0))),
+    )
+    return seen[-1]

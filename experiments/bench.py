@@ -1,0 +1,58 @@
+"""Draw what `make bench ARGS="--out bench.json"` measured: `python experiments/bench.py`."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import tyro
+
+HERE = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw each stage's time a robot step, and its share of what the machine allows."""
+
+    measured: Path = HERE / "bench.json"
+    """what the benchmark wrote"""
+    out: Path = HERE / "bench.png"
+    """the picture to write"""
+
+
+def main() -> None:
+    """Read the figures and draw them."""
+    options = tyro.cli(Options)
+    found = json.loads(options.measured.read_text())
+    figure, (times, shares) = plt.subplots(
+        1, 2, figsize=(11, 5), sharey=True, constrained_layout=True
+    )
+    stages = list(dict.fromkeys(row["stage"] for row in found["rows"]))[::-1]
+    counts = sorted({row["robots"] for row in found["rows"]})
+    for k, count in enumerate(counts):
+        rows = [row for row in found["rows"] if row["robots"] == count]
+        height = 0.8 / len(counts)
+        y = [stages.index(row["stage"]) + (k - 0.5 * (len(counts) - 1)) * height for row in rows]
+        microseconds = [1e6 * row["seconds"] / count for row in rows]
+        times.barh(y, microseconds, height, label=f"{count} robots")
+        share = [100.0 * (row["share"] or 0.0) for row in rows]
+        shares.barh(y, share, height)
+    times.set_yticks(range(len(stages)), stages)
+    times.set_xlabel("us for a control step of a robot, on all cores")
+    times.legend()
+    shares.set_xlabel("% of what the machine allows; none where nothing says what that is")
+    figure.suptitle(_title(found))
+    figure.savefig(options.out, dpi=100)
+
+
+def _title(found: dict[str, Any]) -> str:
+    products = found["rates"]["products"] / 1e9
+    return f"{found['terrain']}, {found['machine']}, {products:,.0f} GFLOP/s a device"
+
+
+if __name__ == "__main__":
+    main()
