@@ -6,7 +6,6 @@ stage's share is that of the least time that its matrix products, at the rate of
 arrays, at the rate of a copy, would take here; that of the physics is MuJoCo's own batch.
 """
 
-import dataclasses
 import functools
 import json
 import os
@@ -17,8 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import tyro
+from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
 
@@ -26,24 +25,20 @@ from cref_jax import (
     brax_peer,
     cli,
     config,
-    depth,
-    env,
-    foothold,
     lanes,
     learn,
     peers,
-    ppo,
     processes,
     rollout,
     roofline,
     runs,
+    stages,
 )
 from cref_jax.config import Config
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.roofline import Rates
 from cref_jax.world import World
 
-STEPS = 12  # control steps of one timed call
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
 BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the same"
 
@@ -105,8 +100,8 @@ def measure(options: Options, rates: Rates) -> list[Row]:
     for engine in options.engines:
         if engine != resolve_engine("auto"):
             with console.status(f"engine {engine}: compiling and timing"):
-                world = runs.world_of(_config(options, most), engine)
-                rows += _engine(options, rates, engine, world, _started(world, most))
+                world, state = _started(_config(options, most), engine)
+                rows += _engine(options, rates, engine, world, state.robots)
     with console.status("whole iteration: compiling and timing"):
         rows.append(_iteration(options, ITERATION, _preset(options.terrain)))
     if options.brax:
@@ -124,16 +119,16 @@ def _learners(options: Options) -> list[Row]:
 
 def _stages(options: Options, rates: Rates, count: int) -> list[Row]:
     """Return the times of the stages for so many robots."""
-    world = runs.world_of(_config(options, count), resolve_engine("auto"))
-    state = jax.jit(learn.initial_state)(world)
+    world, state = _started(_config(options, count), resolve_engine("auto"))
     timed = functools.partial(_timed, options, rates, count)
     return [
         *_engine(options, rates, resolve_engine("auto"), world, state.robots),
-        timed("terrain query", _queries, world, state.robots),
-        timed("depth, 20 Hz", _frames, world, state.robots),
-        timed(FOOTHOLD, _footholds, world, state.robots),
-        timed("policy", _policy, world, state),
-        timed("update, one epoch", _update, world, state),
+        timed("terrain query", stages.query_terrain, world, state.robots),
+        timed("depth, 20 Hz", stages.render_frames, world, state.robots),
+        timed(FOOTHOLD, stages.find_footholds, world, state.robots),
+        # no share: work_of does not know in how many of the steps a frame is encoded
+        timed("policy", stages.run_policy, world, state)._replace(share=None),
+        timed("update, one epoch", stages.update, world, state),
     ]
 
 
@@ -143,18 +138,17 @@ def _engine(
     """Return the times of a step with this engine, beside MuJoCo's own batch."""
     count = len(robots.begins)
     timed = functools.partial(_timed, options, rates, count)
-    rows = [
-        timed(f"environment step, {engine}", _steps, world, robots)._replace(share=None),
-        timed(f"physics, {engine}", _physics, world, robots)._replace(share=None),
-    ]
+    whole = timed(f"environment step, {engine}", stages.step_environment, world, robots)
+    ours = timed(f"physics, {engine}", stages.step_physics, world, robots)
+    whole, ours = whole._replace(share=None), ours._replace(share=None)
     if engine != "mujoco":
-        return rows
+        return [whole, ours]
     substeps, threads = world.config.physics.substeps, processes.cores()
     alone = peers.raw_substep(
-        world.physics, robots.env.body, threads, STEPS * substeps, options.repeats
+        world.physics, robots.env.body, threads, stages.STEPS * substeps, options.repeats
     )
     raw = Row("physics, MuJoCo's own batch", count, alone * substeps, 0.0)
-    return [rows[0], rows[1]._replace(share=raw.seconds / rows[1].seconds), raw]
+    return [whole, ours._replace(share=raw.seconds / ours.seconds), raw]
 
 
 def _config(options: Options, count: int) -> Config:
@@ -173,9 +167,11 @@ def _preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
     return c
 
 
-def _started(world: World, count: int) -> rollout.Robots:
-    start = jax.jit(rollout.start, static_argnames="num_envs")
-    return start(world, jax.random.key(0), count)
+def _started(c: Config, engine: EngineName) -> tuple[World, learn.RunState]:
+    """Return the world and the first state of a run, shared out among the devices."""
+    mesh = runs.mesh_of(c)
+    world = runs.world_of(c, engine, max(processes.cores() // mesh.size, 1))
+    return world, jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
 
 
 def compare_depth(options: Options) -> list[peers.Speed]:
@@ -262,24 +258,31 @@ def _timed(
     stage: str,
     make: Callable[..., Any],
     world: World,
-    *arguments: Any,
+    state: rollout.Robots | learn.RunState,
 ) -> Row:
-    """Compile a stage and return its best time for one control step."""
+    """Compile a stage and return its best time for one control step.
+
+    Every device does it with its own robots, as in training.
+    """
+    mesh, parts = runs.mesh_of(world.config), learn.partition(world)
+    part = parts if isinstance(state, learn.RunState) else parts.robots
+    shared = functools.partial(jax.shard_map, mesh=mesh, out_specs=P(), check_vma=False)
     # the world is closed over, so not counted: of all lanes a stage reads a little
-    least = roofline.work_of(functools.partial(make, world), *arguments).seconds(rates)
+    alone = shared(functools.partial(make, world), in_specs=(part,))
+    work = roofline.work_of(alone, state)
+    least = work._replace(moved=work.moved // mesh.size).seconds(rates)
     begun = time.perf_counter()
-    program = jax.jit(make).lower(world, *arguments).compile()
+    program = jax.jit(shared(make, in_specs=(P(), part))).lower(world, state).compile()
     compiled = time.perf_counter() - begun
-    run = lambda: jax.block_until_ready(program(world, *arguments))
+    run = lambda: jax.block_until_ready(program(world, state))
     seconds = peers.shortest(run, options.repeats)
-    return Row(stage, count, seconds / STEPS, compiled, least / seconds)
+    return Row(stage, count, seconds / stages.STEPS, compiled, least / seconds)
 
 
 def _iteration(options: Options, stage: str, c: Config) -> Row:
     """Return the time of a whole iteration of `make train` with these settings."""
     mesh = runs.mesh_of(c)
-    world = runs.world_of(c, resolve_engine("auto"), max(processes.cores() // mesh.size, 1))
-    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
+    world, state = _started(c, resolve_engine("auto"))
     begun = time.perf_counter()
     program = learn.chunk.lower(world, state, mesh, c.run.chunk).compile()
     compiled = time.perf_counter() - begun
@@ -291,102 +294,6 @@ def _iteration(options: Options, stage: str, c: Config) -> Row:
 
     seconds = peers.shortest(step, options.repeats)
     return Row(stage, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compiled)
-
-
-def _steps(world: World, robots: rollout.Robots) -> Any:
-    """Step the whole environment under small random actions."""
-    joints = robots.env.action.shape[-1]
-
-    def step(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, Any]:
-        action = 0.3 * jax.random.normal(key, (*state.step.shape, joints))
-        state, outcome = env.step_all(world, state, action)
-        return state, (outcome.reward.sum(), outcome.observation.privileged.sum())
-
-    return jax.lax.scan(step, robots.env, jax.random.split(jax.random.key(1), STEPS))
-
-
-def _physics(world: World, robots: rollout.Robots) -> Any:
-    """Step the physics alone, with its terrain queries."""
-    target = jnp.asarray(world.physics.robot.nominal_pose)
-
-    def one(state: env.EnvState, body: Any) -> Any:
-        ground = world.lanes.tile(state.level, state.kind)
-        return world.physics.step(
-            ground, body, jnp.stack([target, target]), state.delay, state.dynamics
-        )[0]
-
-    step = lambda body, _: (jax.vmap(one)(robots.env, body), None)
-    return jax.lax.scan(step, robots.env.body, None, length=STEPS)[0]
-
-
-def _queries(world: World, robots: rollout.Robots) -> Any:
-    """Ask for the tangent planes of all spheres, as often as a control step does."""
-
-    def one(state: env.EnvState, body: Any) -> Any:
-        return world.physics.planes(world.lanes.tile(state.level, state.kind), body)
-
-    def query(body: Any, _: None) -> tuple[Any, None]:
-        position, rotation = jax.vmap(one)(robots.env, body)
-        moved = 1e-6 * (position.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
-        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
-
-    count = STEPS * world.config.physics.substeps
-    return jax.lax.scan(query, robots.env.body, None, length=count)[0]
-
-
-def _frames(world: World, robots: rollout.Robots) -> Any:
-    """Render as many images as come in so many control steps."""
-    c = world.config
-    count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
-
-    def render(state: env.EnvState, _: None) -> tuple[env.EnvState, None]:
-        images = rollout.exposed(world, state)
-        moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
-        return state.replace(camera_pitch=state.camera_pitch + moved), None
-
-    return jax.lax.scan(render, robots.env, None, length=count)[0]
-
-
-def _footholds(world: World, robots: rollout.Robots) -> Any:
-    """Find candidates and measure the distance to them, as each control step does."""
-    c = world.config.foothold
-
-    def one(state: env.EnvState, body: Any) -> Any:
-        ground = world.lanes.tile(state.level, state.kind)
-        soles = foothold.soles(world.physics.links(body), world.physics.robot)
-        near = foothold.distance(state.candidates, soles.centre)
-        ahead = foothold.candidates(ground, soles.centre, soles.heading, state.command[0], c)
-        lost = foothold.unsupported(ground, soles, c)
-        return near.sum() + ahead.z.sum() + ahead.accepted.sum() + lost.sum()
-
-    def find(body: Any, _: None) -> tuple[Any, None]:
-        found = jax.vmap(one)(robots.env, body)
-        moved = 1e-9 * jnp.where(jnp.isfinite(found), found, 0.0)
-        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
-
-    return jax.lax.scan(find, robots.env.body, None, length=STEPS)[0]
-
-
-def _policy(world: World, state: learn.RunState) -> Any:
-    """Run the policy alone."""
-    nets = rollout.networks(world.config.network, state.robots.env.action.shape[-1])
-
-    def step(robots: rollout.Robots, _: None) -> tuple[rollout.Robots, Any]:
-        memory, policy = rollout.act(nets, state.train, robots)
-        return robots.replace(memory=memory), policy.mean.sum()
-
-    return jax.lax.scan(step, state.robots, None, length=STEPS)
-
-
-def _update(world: World, state: learn.RunState) -> Any:
-    """Run one epoch of the update on a rollout of zeros with the right shapes."""
-    c = world.config
-    c = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, horizon=STEPS))
-    nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
-    collect = functools.partial(rollout.collect, dataclasses.replace(world, config=c), nets)
-    shapes = jax.eval_shape(collect, state.train, state.robots, jax.random.key(0))[1]
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets.functions)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
         start,
         mesh=mesh,
         in_specs=(P(), P()),
-        out_specs=_partition(world).robots,
+        out_specs=partition(world).robots,
         check_vma=False,
     )
     robots = shared(world, key_robots)
@@ -72,7 +72,7 @@ def shapes(world: World, mesh: Mesh) -> RunState:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), part)
 
     state = jax.eval_shape(functools.partial(initial_state, mesh=mesh), world)
-    return jax.tree.map(shared, _partition(world), state, is_leaf=lambda x: isinstance(x, P))
+    return jax.tree.map(shared, partition(world), state, is_leaf=lambda x: isinstance(x, P))
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "iterations"), donate_argnames="state")
@@ -98,7 +98,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions, AXIS)
         return RunState(train, robots), losses, trace
 
-    parts = _partition(world)
+    parts = partition(world)
     shared = jax.shard_map(
         learn,
         mesh=mesh,
@@ -120,7 +120,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     return state, log
 
 
-def _partition(world: World) -> RunState:
+def partition(world: World) -> RunState:
     """Return how a run's state is shared out: the robots are, and what is learned is not."""
     return RunState(train=P(), robots=rollout.partition(AXIS, world.config.network.variant))
 

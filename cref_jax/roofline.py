@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import AxisType
+from jax.sharding import PartitionSpec as P
 
 from cref_jax import peers
 
@@ -19,7 +21,7 @@ REPEATS = 10
 
 
 class Rates(NamedTuple):
-    """What one device does at its best."""
+    """What a device does at its best while all others do the same."""
 
     products: float  # FLOP/s of a matrix product in float32
     memory: float  # bytes/s read and written by a copy
@@ -37,11 +39,12 @@ class Work(NamedTuple):
 
 
 def measure() -> Rates:
-    """Time a large product and a large copy on the first device."""
+    """Time a large product and a large copy on every device at once: cores share their memory."""
+    mesh = jax.make_mesh((jax.device_count(),), ("devices",), axis_types=(AxisType.Auto,))
+    each = lambda f: jax.jit(jax.shard_map(f, mesh=mesh, in_specs=P(), out_specs=P("devices")))
     square, long = jnp.ones((SIDE, SIDE)), jnp.ones(COPIED // 4)
-    product = jax.jit(lambda x: x @ x)
-    copy = jax.jit(lambda x: x + 1.0)
     timed = lambda f, x: peers.shortest(lambda: jax.block_until_ready(f(x)), REPEATS)
+    product, copy = each(lambda x: x @ x), each(lambda x: x + 1.0)
     return Rates(2 * SIDE**3 / timed(product, square), 2 * COPIED / timed(copy, long))
 
 

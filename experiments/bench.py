@@ -43,8 +43,8 @@ def main() -> None:
         shares.barh(y, share, height)
     times.set_yticks(range(len(stages)), stages)
     times.set_xlabel("us for a control step of a robot, on all cores")
-    times.legend()
-    shares.set_xlabel("% of what the machine allows; none where nothing says what that is")
+    times.legend(loc="lower right")
+    shares.set_xlabel("% of what the machine allows, where that is known")
     figure.suptitle(_title(found))
     figure.savefig(options.out, dpi=100)
 

@@ -34,7 +34,7 @@ LAYERS = [
     {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
-    {"runs", "stand_in", "table", "run_page", "ood"},
+    {"runs", "stages", "stand_in", "table", "run_page", "ood"},
     {"exported", "ood_verdict", "transfer", "peers", "brax_peer"},
     {"watch", "ood_suite", "roofline"},
     {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},

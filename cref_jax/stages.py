@@ -1,0 +1,116 @@
+"""The stages of an iteration, each alone in a program of its own, for the benchmark.
+
+Each does `STEPS` control steps' worth of its work for the robots that it is given, in such a way
+that XLA can neither drop the work nor do it once for all steps.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cref_jax import depth, env, foothold, learn, ppo, rollout
+from cref_jax.world import World
+
+STEPS = 24  # control steps of one call, as many as a horizon has
+
+
+def step_environment(world: World, robots: rollout.Robots) -> Any:
+    """Step the whole environment under small random actions."""
+    joints = robots.env.action.shape[-1]
+
+    def step(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, Any]:
+        action = 0.3 * jax.random.normal(key, (*state.step.shape, joints))
+        state, outcome = env.step_all(world, state, action)
+        return state, (outcome.reward.sum(), outcome.observation.privileged.sum())
+
+    return jax.lax.scan(step, robots.env, jax.random.split(jax.random.key(1), STEPS))
+
+
+def step_physics(world: World, robots: rollout.Robots) -> Any:
+    """Step the physics alone, with its terrain queries."""
+    target = jnp.asarray(world.physics.robot.nominal_pose)
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        ground = world.lanes.tile(state.level, state.kind)
+        return world.physics.step(
+            ground, body, jnp.stack([target, target]), state.delay, state.dynamics
+        )[0]
+
+    step = lambda body, _: (jax.vmap(one)(robots.env, body), None)
+    return jax.lax.scan(step, robots.env.body, None, length=STEPS)[0]
+
+
+def query_terrain(world: World, robots: rollout.Robots) -> Any:
+    """Ask for the tangent planes of all spheres, as often as a control step does."""
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        return world.physics.planes(world.lanes.tile(state.level, state.kind), body)
+
+    def query(body: Any, _: None) -> tuple[Any, None]:
+        position, rotation = jax.vmap(one)(robots.env, body)
+        moved = 1e-6 * (position.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+
+    count = STEPS * world.config.physics.substeps
+    return jax.lax.scan(query, robots.env.body, None, length=count)[0]
+
+
+def render_frames(world: World, robots: rollout.Robots) -> Any:
+    """Render as many images as come in so many control steps."""
+    c = world.config
+    count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
+
+    def render(state: env.EnvState, _: None) -> tuple[env.EnvState, None]:
+        images = rollout.exposed(world, state)
+        moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
+        return state.replace(camera_pitch=state.camera_pitch + moved), None
+
+    return jax.lax.scan(render, robots.env, None, length=count)[0]
+
+
+def find_footholds(world: World, robots: rollout.Robots) -> Any:
+    """Find candidates and measure the distance to them, as each control step does."""
+    c = world.config.foothold
+
+    def one(state: env.EnvState, body: Any) -> Any:
+        ground = world.lanes.tile(state.level, state.kind)
+        soles = foothold.soles(world.physics.links(body), world.physics.robot)
+        near = foothold.distance(state.candidates, soles.centre)
+        ahead = foothold.candidates(ground, soles.centre, soles.heading, state.command[0], c)
+        lost = foothold.unsupported(ground, soles, c)
+        return near.sum() + ahead.z.sum() + ahead.accepted.sum() + lost.sum()
+
+    def find(body: Any, _: None) -> tuple[Any, None]:
+        found = jax.vmap(one)(robots.env, body)
+        moved = 1e-9 * jnp.where(jnp.isfinite(found), found, 0.0)
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+
+    return jax.lax.scan(find, robots.env.body, None, length=STEPS)[0]
+
+
+def run_policy(world: World, state: learn.RunState) -> Any:
+    """Run the policy alone; it encodes a frame as often as one comes."""
+    c = world.config
+    nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
+
+    def step(robots: rollout.Robots, clock: Any) -> tuple[rollout.Robots, Any]:
+        due = depth.is_due(clock, c.camera, c.physics.control_period)
+        feed = robots.feed and robots.feed.replace(fresh=due)
+        memory, policy = rollout.act(nets, state.train, robots.replace(feed=feed))
+        return robots.replace(memory=memory), policy.mean.sum()
+
+    return jax.lax.scan(step, state.robots, jnp.arange(STEPS))
+
+
+def update(world: World, state: learn.RunState) -> Any:
+    """Run one epoch of the update on a rollout of zeros with the right shapes."""
+    c = world.config
+    c = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, horizon=STEPS))
+    nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
+    collect = functools.partial(rollout.collect, dataclasses.replace(world, config=c), nets)
+    shapes = jax.eval_shape(collect, state.train, state.robots, jax.random.key(0))[1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets.functions, learn.AXIS)
