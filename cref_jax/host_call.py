@@ -9,6 +9,7 @@ for foreign functions, `xla/ffi/api/c_api.h`; only a CPU can call into Python.
 import atexit
 import contextlib
 import ctypes
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -145,7 +146,7 @@ def _arrays(buffers: _Buffers) -> list[np.ndarray]:
         buffer = buffers.values[k].contents
         shape = tuple(buffer.dims[axis] for axis in range(buffer.rank))
         dtype = np.dtype(_DTYPES[buffer.dtype])
-        size = dtype.itemsize * int(np.prod(shape, dtype=int))
+        size = dtype.itemsize * math.prod(shape)
         if not size:
             found.append(np.empty(shape, dtype))
             continue
