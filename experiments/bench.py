@@ -43,7 +43,7 @@ def main() -> None:
         shares.barh(y, share, height)
     times.set_yticks(range(len(stages)), stages)
     times.set_xlabel("us for a control step of a robot, on all cores")
-    times.legend(loc="lower right")
+    times.legend(loc="center right")
     shares.set_xlabel("% of what the machine allows, where that is known")
     figure.suptitle(_title(found))
     figure.savefig(options.out, dpi=100)
