@@ -81,7 +81,7 @@ $(READY): pyproject.toml $(wildcard constraints-*.txt)
 	driver=$$(nvidia-smi --query-gpu=driver_version --format=csv,noheader 2>/dev/null | head -1 | cut -d. -f1) \
 	  || driver=""; \
 	if [[ "$$driver" =~ ^[0-9]+$$ ]]; then \
-	  if (( driver >= 580 )); then extras=$$extras,cuda13; else extras=$$extras,cuda12; fi; \
+	  if (( driver >= 580 )); then extras=$$extras,warp,cuda13; else extras=$$extras,warp,cuda12; fi; \
 	fi; \
 	tested=constraints-py$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])').txt; \
 	echo "installing cref-jax[$$extras] into $(VENV) (a few minutes the first time)"; \

@@ -64,7 +64,7 @@ class Options:
     seed: int = 0
     """of the first states and commands"""
     engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
+    """mujoco steps on the CPU, mjx and warp on the device"""
     out: Path | None = None
     """folder for eval.json and eval.html; the run's own when left out, or the present one"""
     debug: bool = False

@@ -12,6 +12,7 @@ from typing import ParamSpec, TypeVar
 
 import jax
 from jax.experimental.scheduling_groups import xla_metadata_call
+from jaxtyping import PyTree
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -30,3 +31,12 @@ def apart(function: Callable[P, R]) -> Callable[P, R]:
         return xla_metadata_call(inlineable="false")(function)(*args, **kwargs)
 
     return called
+
+
+def stored(values: PyTree) -> PyTree:
+    """Return values that an accelerator has in memory before anything reads them.
+
+    XLA for a GPU would compute them within the kernel that reads them, and where that one turns
+    them over, as patches of an image, element by element: on an H100 in 7 ms instead of one.
+    """
+    return jax.lax.optimization_barrier(values)

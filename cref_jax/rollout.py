@@ -200,7 +200,7 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pix
         if some.size:
             part = jax.tree.map(lambda x, some=some: x[some], state)
             look = kernels.apart(functools.partial(_images, is_profile=flag))
-            images.append(look(world, part))
+            images.append(kernels.stored(look(world, part)))
             robots.append(some)
     image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
     return network.in_patches(world.config.network, image)

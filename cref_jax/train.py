@@ -44,7 +44,7 @@ class Options:
     seed: int | None = None
     """short for --run.seed"""
     engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
+    """mujoco steps on the CPU, mjx and warp on the device"""
     device: Device = "auto"
     """where the program runs; gpu is an error without one"""
     devices: int | None = None

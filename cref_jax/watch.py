@@ -58,7 +58,7 @@ class Options:
     seed: int = 0
     """of the first states"""
     engine: EngineName = "auto"
-    """mujoco steps on the CPU, mjx on the device"""
+    """mujoco steps on the CPU, mjx and warp on the device"""
     debug: bool = False
     """show the traceback of an error"""
 

@@ -418,10 +418,25 @@ def test_a_riser_throws_a_fast_foot_back_as_boxes_do(physics, x2, substep, centr
         np.testing.assert_allclose(body.qpos[i], state.qpos, atol=1e-3)
 
 
-def test_the_engine_is_chosen_by_the_device():
+def test_an_engine_that_is_asked_for_is_taken():
     names = ["mujoco", "mjx", "warp"]
     assert [resolve_engine(name) for name in names] == names
-    assert resolve_engine("auto") == ("mujoco" if jax.default_backend() == "cpu" else "mjx")
+
+
+@pytest.mark.parametrize(
+    ("backend", "devices", "warp", "engine"),
+    [
+        ("cpu", 2, True, "mujoco"),
+        ("gpu", 1, True, "warp"),
+        ("gpu", 1, False, "mjx"),
+        ("gpu", 8, True, "mjx"),
+    ],
+)
+def test_the_engine_is_chosen_by_the_device(monkeypatch, backend, devices, warp, engine):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax, "device_count", lambda: devices)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: warp or None)
+    assert resolve_engine("auto") == engine
 
 
 @pytest.mark.slow
