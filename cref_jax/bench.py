@@ -27,6 +27,7 @@ from cref_jax import (
     config,
     lanes,
     learn,
+    limits,
     peers,
     processes,
     rollout,
@@ -163,7 +164,7 @@ def _preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
     """
     device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     c = config.override(runs.composed(terrain, None, device), changes or {})
-    config.check(c)
+    limits.check(c)
     return c
 
 

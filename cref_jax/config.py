@@ -67,6 +67,8 @@ class RewardWeights:
     action_rate: float = -0.01
     action_smoothness: float = -0.01
     feet_air_time: float = -2.5
+    air_time_variance: float = 0.0  # not in Table I
+    foot_up_when_standing: float = 0.0  # not in Table I
     foot_slip: float = -0.2
     foot_impact_acceleration: float = -0.5
     foot_impact_velocity: float = -1.5
@@ -87,7 +89,10 @@ class Reward:
         0.25  # s that a touchdown counts for then; assumed: for one control step, as
     )
     # legged_gym has it, air time and footholds weigh too little to lengthen a step
-    clip_at_zero: bool = True  # assumed: without it the negative sum at first teaches falling
+    clip_at_zero: bool = True  # of all terms but touchdowns; assumed: without it the negative sum
+    # at first teaches falling
+    debounce: int = 2  # control steps with contact, or without, until a foot counts as down or up;
+    # assumed: a scuff of one step is neither. 1: each contact is a touchdown
     sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym
     sigma_omega: float = 0.25  # rad^2/s^2; assumed: legged_gym
     low_speed: float = 0.2  # m/s, v_s; assumed: between 0.1 and 0.2 in published code
@@ -113,11 +118,15 @@ class Command:
     vy: tuple[float, float] = (-0.3, 0.3)  # m/s; assumed
     yaw_rate: tuple[float, float] = (-1.0, 1.0)  # rad/s; assumed
     standing: float = 0.1  # share of standing commands; assumed
+    lane_free: float = 0.1  # share of the commands on a lane that are as in the open; assumed
     period: tuple[float, float] = (8.0, 12.0)  # s between two draws; assumed
     open_kinds: tuple[str, ...] = ("flat",)  # walked in all directions; the rest along a lane
     lane_vx: tuple[float, float] = (0.4, 0.8)  # m/s on terrain, Sec. III-A
-    heading_gain: float = 1.0  # 1/s, yaw rate per radian off the lane's direction; assumed
-    lane_gain: float = 0.5  # rad/m, heading per metre off the lane's middle; assumed
+    heading_gain: float = 2.0  # 1/s, yaw rate per radian off the lane's direction; assumed
+    lane_gain: float = (
+        1.5  # rad/m, heading per metre off the lane's middle; assumed: with 0.5 robots
+    )
+    # drifted into hand-rails
     lane_yaw_rate: float = 0.6  # rad/s, limit of the heading control; assumed
 
 
@@ -140,6 +149,9 @@ class Randomisation:
     noise_joint_velocity: float = 1.5  # rad/s, +-
     camera_pitch: float = 2.0  # deg, +-, how the camera is mounted
     camera_position: float = 0.01  # m, +-, each axis
+    ramp: bool = False  # begin with none of it, and let it grow with competence
+    ramp_falls: tuple[float, float] = (2.5, 4.0)  # per minute: fewer raise, more lower; assumed
+    ramp_step: float = 0.005  # of all ranges, per iteration; assumed
 
 
 @dataclass(frozen=True)
@@ -155,6 +167,8 @@ class Episode:
     stall_time: float = 5.0  # s between two looks whether a robot stands in its lane, 0: none;
     # assumed: half of what a trial gives it. Nothing is learned from standing before an obstacle
     start_x: tuple[float, float] = (0.5, 1.0)  # m along the lane; assumed
+    start_anywhere: float = 0.0  # share of the episodes that begin on any level stretch of the lane
+    # before its last obstacle; assumed
     start_y: tuple[float, float] = (-0.3, 0.3)  # m across the lane; assumed
     lane_end: float = 1.0  # m before the lane's end where an episode is won; assumed
     yaw_jitter: float = 0.2  # rad, +-, at reset on a lane; assumed
@@ -172,6 +186,7 @@ class Terrain:
     lane_length: float = 12.0  # m; assumed
     lane_width: float = 4.0  # m; assumed
     levels: int = 10  # assumed: as legged_gym
+    variants: int = 1  # lanes of each level and kind, one of which is drawn at each reset; assumed
     seed: int = 1  # of the random heights and landings
 
 
@@ -192,6 +207,8 @@ class Scan:
 
     x: tuple[float, float, int] = (-0.5, 1.1, 17)  # m from, m to, samples; assumed
     y: tuple[float, float, int] = (-0.4, 0.4, 9)  # m from, m to, samples; assumed
+    ahead: tuple[float, float, int] = (-0.2, 1.0, 25)  # m from, m to, samples of a finer row along
+    # x in the middle; assumed: 10 cm cannot say where an edge is
     base_height: float = 0.62  # m, nominal, taken off; the base above the soles at q_0
     clip: float = 1.0  # m; assumed
 
@@ -205,6 +222,8 @@ class Camera:
     d_max: float = 3.0  # m, Sec. II-B; assumed: published work clips at 2 to 3 m
     pitch: float = 50.0  # deg below the horizontal, Sec. III-A
     rate: float = 20.0  # 1/s, Sec. II-D
+    window: int = 1  # pixels, odd: each is the nearest of a square of so many, as a stereo camera
+    # matches squares and sees no hole smaller than one; 1, the paper's: a ray per pixel
 
 
 @dataclass(frozen=True)
@@ -216,6 +235,9 @@ class Foothold:
     window: tuple[int, int] = (12, 5)  # samples: 24 cm x 10 cm, Sec. II-C
     stride: int = 2  # samples: 4 cm, Sec. II-C
     gate_time: float = 0.5  # s of commanded travel, Sec. II-C
+    gate: Literal["points", "windows"] = "points"  # what is removed for being nearer than that: the
+    # points, so that a window is of those that remain (Sec. II-C), or each window with such a point
+    min_points: int = 10  # of a window of remaining points; assumed: two rows of five
     roughness: float = 0.010  # m, r_th; assumed: refuses windows with an edge of 5 cm in them
     verticality: float = 0.9  # eta_th; assumed: slopes up to 0.4 pass, windows over a riser do not
     min_height: float = -0.5  # m, h_min; assumed: two 23 cm treads down pass, a gap's floor not
@@ -240,7 +262,10 @@ class Network:
     gru: int = 256  # recurrent fusion
     actor: tuple[int, ...] = (512, 256, 128)  # action head
     critic: tuple[int, ...] = (512, 256, 128)
+    critic_sees: Literal["paper", "all"] = "all"  # Eq. 3 alone, or with all that the reward depends
+    # on and all that is drawn per robot; assumed
     initial_std: float = 0.8  # of the action distribution
+    min_std: float = 0.0  # of it, while training: late obstacles are found by exploring, too
 
 
 @dataclass(frozen=True)
@@ -329,35 +354,6 @@ def unknown(what: str, name: str, known: list[str], where: str = "") -> str:
     near = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
     return f"unknown {what} '{where}{name}'; {hint}"
-
-
-def check(c: Config) -> None:
-    """Refuse settings that could not run, before anything is compiled.
-
-    Raises:
-        ConfigError: says which setting, and what would be right.
-    """
-    positive = {
-        "run.num_envs": c.run.num_envs,
-        "run.iterations": c.run.iterations,
-        "run.chunk": c.run.chunk,
-        "ppo.horizon": c.ppo.horizon,
-        "ppo.epochs": c.ppo.epochs,
-        "ppo.minibatches": c.ppo.minibatches,
-        "physics.substeps": c.physics.substeps,
-        "terrain.levels": c.terrain.levels,
-        "episode.bank_size": c.episode.bank_size,
-    }
-    for name, value in positive.items():
-        if value < 1:
-            raise ConfigError(f"'{name}' must be at least 1, not {value}")
-    robots, parts = c.run.num_envs, c.ppo.minibatches
-    if robots % parts:
-        below, above = robots // parts * parts, -(-robots // parts) * parts
-        near = f"{below} or {above}" if below else f"{above}"
-        raise ConfigError(f"{robots} robots do not split into {parts} minibatches; take {near}")
-    if not 1e-4 <= c.physics.timestep <= 0.02:
-        raise ConfigError(f"'physics.timestep' must be 0.0001 to 0.02 s, not {c.physics.timestep}")
 
 
 def load_toml(path: Path) -> dict[str, Any]:

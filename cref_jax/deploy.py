@@ -152,6 +152,7 @@ class Policy:
             depth = root.table("depth")
             shape = depth.whole("rows", 8, 1024), depth.whole("columns", 8, 1024)
             self._d_max = depth.real("d_max_m", 0.01, 1000.0)
+            self._window = depth.whole("window", 1, 15) if depth.has("window") else 1
             self._encoder = _Encoder(net, weights, shape)
         self.image_shape = shape  # rows, columns
         self._actor = _Actor(net, weights, shape, size, len(self.joints.names))
@@ -241,7 +242,7 @@ class Policy:
         if not valid.all():
             # 1 / depth of a plane is linear in the image: level ground is filled in as it is
             share = np.where(valid, share, 1.0 / _filled(1.0 / share, valid))
-        image = (share - 0.5).astype(np.float32)
+        image = (_nearest_around(share, self._window) - 0.5).astype(np.float32)
         encoded = self._encoder(image.astype(np.float16).astype(np.float32))  # as training had it
         with self._lock:
             self._actor.look(*encoded)
@@ -657,6 +658,14 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(row, some, lines[some, j]) for j in column], axis=1)
 
 
+def _nearest_around(image: np.ndarray, window: int) -> np.ndarray:
+    """Return the least of the window x window values around each pixel, at the rims of fewer."""
+    reach, (rows, columns) = window // 2, image.shape
+    wide = np.pad(image, reach, constant_values=np.inf)
+    lines = np.minimum.reduce([wide[k : k + rows] for k in range(window)])
+    return np.minimum.reduce([lines[:, k : k + columns] for k in range(window)])
+
+
 def _vector(value: Any, size: int) -> np.ndarray | None:
     """Return f32[size], or None where the value is not so many finite numbers."""
     try:
@@ -763,6 +772,10 @@ class _Table:
         if len(values) != count:
             raise self._refuse(key, f"{count} numbers")
         return values
+
+    def has(self, key: str) -> bool:
+        """Return whether there is such an entry: those of a later format may be missing."""
+        return key in self._values
 
     def whole(self, key: str, low: int, high: int) -> int:
         """Return a whole number in [low, high]."""

@@ -4,6 +4,7 @@ The image is the distance along the optical axis, as a RealSense reports it (Sec
 camera's x right, y down, z forward; pixel (0, 0) is at the top left.
 """
 
+import functools
 import math
 from fractions import Fraction
 
@@ -45,6 +46,23 @@ def render(
         ground = march.ground_depth(terrain, position, rotation, x, y, camera)
     links = _links(position, rotation, capsules, x, y)
     return jnp.minimum(jnp.minimum(ground, links), camera.d_max)
+
+
+def nearest_around(depth: Float[Array, "H W"], window: int) -> Float[Array, "H W"]:
+    """Return the nearest depth of the `window` x `window` pixels around each, at the rims of fewer.
+
+    A stereo camera matches squares: what stands before a hole smaller than one covers it.
+    """
+    for axis, size in enumerate(depth.shape):
+        reach = window // 2
+        wide = jnp.pad(
+            depth,
+            [(reach, reach) if k == axis else (0, 0) for k in (0, 1)],
+            constant_values=jnp.inf,
+        )
+        shifted = [jax.lax.slice_in_dim(wide, k, k + size, axis=axis) for k in range(window)]
+        depth = functools.reduce(jnp.minimum, shifted)
+    return depth
 
 
 def normalise(depth: Float[Array, "*n H W"], camera: config.Camera) -> Float[Array, "*n H W"]:

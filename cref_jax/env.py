@@ -11,13 +11,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from cref_jax import config, depth, episode, foothold, geometry, observation, reward, terrain
+from cref_jax import (
+    config,
+    depth,
+    episode,
+    foothold,
+    gait,
+    geometry,
+    observation,
+    reward,
+    terrain,
+)
 from cref_jax.episode import Ending, EnvState
 from cref_jax.foothold import Soles
 from cref_jax.kinematics import Links
 from cref_jax.observation import Observation
 from cref_jax.physics import Body
 from cref_jax.world import World
+
+FAR = 1.0  # m, of a foothold, for the critic; assumed: beyond, the reward is nothing
 
 
 class Measures(NamedTuple):
@@ -54,16 +66,29 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     clean = observation.motion(state.body.qpos, state.body.qvel, state.action.size)
     sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
     if c.randomisation.enabled:
-        sensed = observation.with_noise(sensed, c.randomisation, key)
+        sensed = observation.with_noise(sensed, c.randomisation, state.spread, key)
     see = lambda m: observation.proprioception(
         m, state.command, jnp.asarray(robot.nominal_pose), state.action
     )
     scan = observation.height_scan(_ground(world, state), state.body.qpos, c.scan)
+    hidden = _hidden(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),
-        privileged=observation.privileged(see(clean), clean.velocity, scan),
+        privileged=observation.privileged(see(clean), clean.velocity, hidden, scan),
         velocity=clean.velocity,
     )
+
+
+def _hidden(world: World, state: EnvState) -> Float[Array, " H"]:
+    """Return what else decides rewards and motion: phases, footholds, a_{t-2}, what was drawn."""
+    gait, dynamics = state.gait, state.dynamics
+    row = observation.fine_row(_ground(world, state), state.body.qpos, world.config.scan)
+    numbers = (state.since_single, dynamics.friction, dynamics.payload, state.delay)
+    parts = (
+        *(gait.down, gait.air_time, gait.last_air_time, state.foothold_distance),
+        *(state.action_before, dynamics.com_shift, state.joint_offset, row),
+    )
+    return jnp.concatenate([jnp.stack([x.astype(jnp.float32) for x in numbers]), *parts])
 
 
 def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[EnvState, Outcome]:
@@ -128,7 +153,10 @@ def _advanced(
 
     links = world.physics.links(body)
     soles = foothold.soles(links, world.physics.robot)
-    snapshot = _snapshot(world, state, body, links, soles, force, action)
+    touching = reward.is_touching(force, c.reward)
+    feet, swings = gait.advanced(state.gait, touching, c.physics.control_period, c.reward.debounce)
+    state = state.replace(gait=feet)
+    snapshot = _snapshot(world, state, body, links, soles, force, swings, action)
     lived = _lived(world, state, body, soles, snapshot)
     gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
     ending = episode.ending(world, lived, links, unstable)
@@ -147,7 +175,7 @@ def _renewed(
     key_level, key_reset, key_see = keys
     done = outcome.ending.terminated | outcome.ending.truncated
     rank, level = episode.promoted(world, lived, outcome.ending, key_level)
-    fresh = episode.reset(world, key_reset, lived.kind, level).replace(rank=rank)
+    fresh = episode.reset(world, key_reset, lived.kind, level, lived.spread).replace(rank=rank)
     first = observe(world, fresh, key_see)
     choose = lambda new, old: jnp.where(done, new, old)
     seen = jax.tree.map(choose, first, outcome.observation)
@@ -167,11 +195,11 @@ def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Floa
     capsules = depth.capsules_in_view(links, robot.capsules)
     ground = _ground(world, state)
     metres = depth.render(ground, position, rotation, capsules, camera, is_profile)
-    return depth.normalise(metres, camera)
+    return depth.normalise(depth.nearest_around(metres, camera.window), camera)
 
 
 def _ground(world: World, state: EnvState) -> terrain.Terrain:
-    return world.lanes.tile(state.level, state.kind)
+    return world.lanes.tile(state.level, state.kind, state.variant)
 
 
 def _target(world: World, state: EnvState, action: Float[Array, " J"]) -> Float[Array, " J"]:
@@ -192,9 +220,13 @@ def _snapshot(
     links: Links,
     soles: Soles,
     force: Float[Array, "F 3"],
+    swings: gait.Swings,
     action: Float[Array, " J"],
 ) -> reward.Snapshot:
-    """Return what the reward may look at, from the state before the step and the body after it."""
+    """Return what the reward may look at, from the state before the step and the body after it.
+
+    The feet's gait is that of after the step.
+    """
     c, feet = world.config, world.physics.feet
     period = c.physics.control_period
     foot = links.position[feet]
@@ -218,8 +250,9 @@ def _snapshot(
         foot_velocity=links.velocity[feet],
         foot_velocity_before=state.foot_velocity,
         foot_force=force,
-        first_contact=touching & (state.air_time > 0.0),
-        air_time=state.air_time + period,
+        first_contact=swings.touchdown,
+        air_time=swings.air_time,
+        last_air_time=state.gait.last_air_time,
         foothold_distance=foothold.distance(state.candidates, soles.centre),
         unsupported=foothold.unsupported(_ground(world, state), soles, c.foothold),
         since_single=jnp.where(single, 0.0, state.since_single + period),
@@ -240,10 +273,10 @@ def _lived(world: World, state: EnvState, body: Body, soles: Soles, s: reward.Sn
         action=s.action,
         action_before=s.action_1,
         foot_velocity=s.foot_velocity,
-        air_time=jnp.where(touching, 0.0, s.air_time),
         since_single=s.since_single,
         support_z=jnp.where(touching.any(), support, state.support_z),
-        candidates=foothold.updated(state.candidates, ahead, ~touching & (state.air_time == 0.0)),
+        foothold_distance=jnp.minimum(s.foothold_distance, FAR),
+        candidates=foothold.updated(state.candidates, ahead, touching & state.gait.down),
         step=state.step + 1,
     )
 
@@ -258,7 +291,7 @@ def _measures(
         speed_error=jnp.linalg.norm(s.command[:2] - s.velocity[:2]),
         forward_speed=s.velocity[0],
         forward_command=s.command[0],
-        airborne=state.air_time > 0.0,
+        airborne=~state.gait.down,
         touchdown=s.first_contact,
         foothold_distance=s.foothold_distance,
         progress=state.body.qpos[0] - state.start[0],

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import config, foothold, geometry, stall
+from cref_jax import config, foothold, gait, geometry, stall
 from cref_jax.foothold import Candidates
+from cref_jax.gait import Gait
 from cref_jax.host_physics import Dynamics
 from cref_jax.kinematics import Links
 from cref_jax.physics import Body
@@ -26,25 +27,29 @@ class EnvState:
 
     key: PRNGKeyArray
     body: Body
+    spread: Float[Array, ""]  # share of the randomisation's ranges
     dynamics: Dynamics
     joint_offset: Float[Array, " J"]  # rad, encoder zero
     delay: Int[Array, ""]  # substeps until a new target arrives
     kind: Int[Array, ""]  # of terrain
     level: Int[Array, ""]  # of difficulty, of the lane that it is on
+    variant: Int[Array, ""]  # which lane of that level
     rank: Int[Array, ""]  # the hardest level that it has earned
     start: Float[Array, "2"]  # m, where the episode began
     command: Float[Array, "3"]  # m/s, m/s, rad/s
+    is_steered: Bool[Array, ""]  # its yaw rate leads along the lane
     command_left: Int[Array, ""]  # control steps until the next draw
     push_left: Int[Array, ""]  # control steps until the next push
-    commanded: Float[Array, ""]  # m, distance asked for so far
+    commanded: Float[Array, ""]  # m, distance asked for so far, along the lane where there is one
     mark: Float[Array, "2"]  # m, x and the distance asked for at the last look for a stall
     action: Float[Array, " J"]  # a_{t-1}
     action_before: Float[Array, " J"]  # a_{t-2}
     foot_velocity: Float[Array, "F 3"]  # m/s, world
-    air_time: Float[Array, " F"]  # s since each foot touched
+    gait: Gait
     since_single: Float[Array, ""]  # s since one foot alone touched
     support_z: Float[Array, ""]  # m, height of the last support
-    candidates: Candidates  # where each foot may step, since its last liftoff
+    candidates: Candidates  # where each foot may step, as seen when it last bore on the ground
+    foothold_distance: Float[Array, " F"]  # m, of each sole from the nearest of them, up to a limit
     camera_pitch: Float[Array, ""]  # rad, error of the camera's mount
     camera_shift: Float[Array, "3"]  # m, error of the camera's mount
     step: Int[Array, ""]  # control steps into the episode
@@ -73,25 +78,37 @@ class Ending(NamedTuple):
         return (self.finished | self.timeout | self.stalled) & ~self.terminated
 
 
-def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Array, ""]) -> EnvState:
-    """Return a robot at the start of a lane of that kind and level."""
+def reset(
+    world: World,
+    key: PRNGKeyArray,
+    kind: Int[Array, ""],
+    level: Int[Array, ""],
+    spread: Float[ArrayLike, ""] = 1.0,
+) -> EnvState:
+    """Return a robot on a lane of that kind and level, with a share of the randomisation."""
     c = world.config
-    keys = jax.random.split(key, 7)
+    keys = jax.random.split(key, 8)
     joints = len(world.physics.robot.joint_names)
-    body = _placed(world, keys[0])
-    dynamics, offset, delay = _drawn_dynamics(world, keys[1])
+    spread = jnp.asarray(spread, jnp.float32)
+    variant = jax.random.randint(keys[7], (), 0, world.lanes.variants)
+    body = _placed(world, keys[0], kind, level, variant)
+    command, is_steered = _drawn_command(world, keys[3], kind)
+    dynamics, offset, delay = _drawn_dynamics(world, keys[1], spread)
     pitch, shift = _drawn_mount(c.randomisation, keys[6])
     return EnvState(
         key=keys[2],
         body=body,
+        spread=spread,
         dynamics=dynamics,
         joint_offset=offset,
         delay=delay,
         kind=kind,
         level=level,
+        variant=variant,
         rank=level,
         start=body.qpos[:2],
-        command=_drawn_command(world, keys[3], kind),
+        command=command,
+        is_steered=is_steered,
         command_left=_drawn_steps(c, keys[4], c.command.period),
         push_left=_drawn_steps(c, keys[5], c.randomisation.push_period),
         commanded=jnp.zeros(()),
@@ -99,12 +116,13 @@ def reset(world: World, key: PRNGKeyArray, kind: Int[Array, ""], level: Int[Arra
         action=jnp.zeros(joints),
         action_before=jnp.zeros(joints),
         foot_velocity=jnp.zeros((2, 3)),
-        air_time=jnp.zeros(2),
+        gait=gait.standing(),
         since_single=jnp.zeros(()),
         support_z=body.qpos[2] - c.reward.base_height_target,
         candidates=foothold.none(c.foothold),
-        camera_pitch=pitch,
-        camera_shift=shift,
+        foothold_distance=jnp.ones(2),
+        camera_pitch=spread * pitch,
+        camera_shift=spread * shift,
         step=jnp.zeros((), jnp.int32),
     )
 
@@ -115,6 +133,7 @@ class Draws(NamedTuple):
     shove: Float[Array, "2"]  # m/s
     push_left: Int[Array, ""]
     command: Float[Array, "3"]  # m/s, m/s, rad/s
+    is_steered: Bool[Array, ""]
     command_left: Int[Array, ""]
 
 
@@ -129,10 +148,12 @@ def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRN
     c = world.config
     (key_shove, key_after), most = jax.random.split(key_push), c.randomisation.push_velocity
     key_next, key_left = jax.random.split(key_command)
+    command, is_steered = _drawn_command(world, key_next, state.kind)
     return Draws(
         shove=jax.random.uniform(key_shove, (2,), minval=-most, maxval=most),
         push_left=_drawn_steps(c, key_after, c.randomisation.push_period),
-        command=_drawn_command(world, key_next, state.kind),
+        command=command,
+        is_steered=is_steered,
         command_left=_drawn_steps(c, key_left, c.command.period),
     )
 
@@ -142,7 +163,7 @@ def pushed(world: World, state: EnvState, draws: Draws) -> EnvState:
     if not world.config.randomisation.enabled:
         return state
     due = state.push_left <= 0
-    qvel = state.body.qvel.at[:2].add(jnp.where(due, draws.shove, 0.0))
+    qvel = state.body.qvel.at[:2].add(jnp.where(due, state.spread * draws.shove, 0.0))
     return state.replace(
         body=state.body._replace(qvel=qvel),
         push_left=jnp.where(due, draws.push_left, state.push_left - 1),
@@ -150,10 +171,11 @@ def pushed(world: World, state: EnvState, draws: Draws) -> EnvState:
 
 
 def commanded(world: World, state: EnvState, draws: Draws) -> EnvState:
-    """Take a new command when one is due; on a lane, steer back to its middle and direction."""
+    """Take a new command when one is due; if it leads along the lane, steer back to its middle."""
     c = world.config
     due = state.command_left <= 0
     command = jnp.where(due, draws.command, state.command)
+    is_steered = jnp.where(due, draws.is_steered, state.is_steered)
 
     heading = geometry.yaw(state.body.qpos[3:7])
     wanted = jnp.clip(-c.command.lane_gain * state.body.qpos[1], -0.5, 0.5)  # rad
@@ -161,11 +183,13 @@ def commanded(world: World, state: EnvState, draws: Draws) -> EnvState:
     limit = c.command.lane_yaw_rate
     steer = jnp.clip(c.command.heading_gain * error, -limit, limit)
     is_open = jnp.asarray(np.isin(world.lanes.kinds, c.command.open_kinds))[state.kind]
-    command = command.at[2].set(jnp.where(is_open, command[2], steer))
+    command = command.at[2].set(jnp.where(is_steered, steer, command[2]))
+    asked = (is_steered | is_open) * jnp.linalg.norm(command[:2])  # m/s
     return state.replace(
         command=command,
+        is_steered=is_steered,
         command_left=jnp.where(due, draws.command_left, state.command_left - 1),
-        commanded=state.commanded + jnp.linalg.norm(command[:2]) * c.physics.control_period,
+        commanded=state.commanded + asked * c.physics.control_period,
     )
 
 
@@ -179,10 +203,10 @@ def ending(world: World, state: EnvState, links: Links, unstable: Bool[Array, ""
     return Ending(
         tilted=gravity_z > -jnp.cos(c.episode.max_tilt),
         low=pelvis_z - state.support_z < c.episode.min_height,
-        hit=world.physics.is_hit(world.lanes.tile(state.level, state.kind), links),
+        hit=world.physics.is_hit(world.lanes.tile(state.level, state.kind, state.variant), links),
         dropped=foot_z.min() < state.support_z - c.episode.below_edge,
         unstable=unstable,
-        stalled=has_end & _looks(world, state) & _stands(state),
+        stalled=has_end & _looks(world, state) & _stands(world, state),
         finished=has_end & (state.body.qpos[0] > world.lanes.end - c.episode.lane_end),
         timeout=state.step >= round(c.episode.length / c.physics.control_period),
     )
@@ -199,16 +223,18 @@ def promoted(
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Return the rank after an episode, and the level of the next.
 
-    A good episode on the level of its rank earns the robot the next one, a poor one costs it this
-    one: it went less than a share of what the whole episode asked for, however it ended. Most
-    episodes are on that level; some, and all after the hardest one has been passed, are on any
-    level up to it, since a robot forgets what it no longer meets.
+    A good episode on the level of its rank, from the start of the lane, earns the robot the next
+    one, a poor one costs it this one: it went less than a share of what the whole episode asked
+    for, however it ended. Most episodes are on that level; some, and all after the hardest one has
+    been passed, are on any level up to it, since a robot forgets what it no longer meets.
     """
     c, top = world.config.curriculum, world.lanes.levels - 1
     if not c.enabled:
         return state.rank, state.level
     walked = state.body.qpos[0] - state.start[0]
-    up = ~over.terminated & ~over.stalled & (over.finished | (walked > c.up * world.lanes.length))
+    from_start = state.start[0] <= world.config.episode.start_x[1]
+    passed = over.finished | (walked > c.up * world.lanes.length)
+    up = from_start & ~over.terminated & ~over.stalled & passed
     down = ~up & (walked < c.down * _asked(world, state))
     earned = state.rank + (up.astype(jnp.int32) - down) * (state.level == state.rank)
     rank = jnp.clip(earned, 0, top)
@@ -225,32 +251,52 @@ def _looks(world: World, state: EnvState) -> Bool[Array, ""]:
     return state.step % round(c.episode.stall_time / c.physics.control_period) == 0
 
 
-def _stands(state: EnvState) -> Bool[Array, ""]:
-    """Return whether the robot has hardly come forward since the last look."""
+def _stands(world: World, state: EnvState) -> Bool[Array, ""]:
+    """Return whether the robot has hardly come forward since the last look.
+
+    It is not judged where it was told to stand, or to go elsewhere, for a part of that time.
+    """
+    c = world.config
     came, asked = state.body.qpos[0] - state.mark[0], state.commanded - state.mark[1]
-    return came < stall.STALL_SHARE * asked
+    least = c.command.lane_vx[0] * (c.episode.stall_time - 2.0 * c.physics.control_period)
+    return (came < stall.STALL_SHARE * asked) & (asked >= least)
 
 
 def _asked(world: World, state: EnvState) -> Float[Array, ""]:
     """Return the distance that the command asks for in a whole episode, at most the lane, m."""
     c = world.config
     left = c.episode.length - state.step * c.physics.control_period
-    asked = state.commanded + left * jnp.linalg.norm(state.command[:2])
+    asked = state.commanded + left * state.is_steered * jnp.linalg.norm(state.command[:2])
     return jnp.minimum(asked, world.lanes.end - c.episode.lane_end - state.start[0])
 
 
-def _placed(world: World, key: PRNGKeyArray) -> Body:
-    """Return a settled state from the bank, somewhere on the lane's start, turned a little."""
+def _placed(
+    world: World,
+    key: PRNGKeyArray,
+    kind: Int[Array, ""],
+    level: Int[Array, ""],
+    variant: Int[Array, ""],
+) -> Body:
+    """Return a settled state from the bank, turned a little.
+
+    It stands somewhere on the lane's start, or for a share of the episodes on another level stretch
+    of it.
+    """
     c = world.config.episode
-    key_pick, key_x, key_y, key_yaw = jax.random.split(key, 4)
+    key_pick, key_x, key_y, key_yaw, key_where = jax.random.split(key, 5)
     pick = jax.random.randint(key_pick, (), 0, c.bank_size)
     body = jax.tree.map(lambda x: x[pick], world.bank)
     uniform = lambda k, low, high: jax.random.uniform(k, (), minval=low, maxval=high)
     turn = uniform(key_yaw, -c.yaw_jitter, c.yaw_jitter)
     about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
-    place = jnp.stack([uniform(key_x, *c.start_x), uniform(key_y, *c.start_y)])
+    x, z = uniform(key_x, *c.start_x), jnp.zeros(())
+    if c.start_anywhere > 0.0:
+        there, height = world.lanes.level_place(kind, level, variant, key_where)
+        elsewhere = (jax.random.uniform(key_x) < c.start_anywhere) & jnp.isfinite(there)
+        x, z = jnp.where(elsewhere, there, x), jnp.where(elsewhere, height, z)
+    place = jnp.stack([x, uniform(key_y, *c.start_y), body.qpos[2] + z])
     return Body(
-        qpos=body.qpos.at[:2]
+        qpos=body.qpos.at[:3]
         .set(place)
         .at[3:7]
         .set(geometry.quat_multiply(about_z, body.qpos[3:7])),
@@ -260,27 +306,32 @@ def _placed(world: World, key: PRNGKeyArray) -> Body:
 
 
 def _drawn_dynamics(
-    world: World, key: PRNGKeyArray
+    world: World, key: PRNGKeyArray, spread: Float[Array, ""]
 ) -> tuple[Dynamics, Float[Array, " J"], Int[Array, ""]]:
-    """Draw the robot's dynamics, its encoder offsets and its action delay in substeps."""
+    """Draw the robot's dynamics, its encoder offsets and its action delay in substeps.
+
+    `spread` is the share of all ranges that is drawn from.
+    """
     c, nominal = world.config.randomisation, world.physics.nominal_dynamics()
     if not c.enabled:
         return nominal, jnp.zeros_like(nominal.kp), jnp.zeros((), jnp.int32)
     keys = jax.random.split(key, 7)
     draw = lambda k, shape, low, high: jax.random.uniform(k, shape, minval=low, maxval=high)
+    within = lambda middle, drawn: middle + spread * (drawn - middle)
     joints = nominal.kp.shape
     dynamics = Dynamics(
-        friction=draw(keys[0], (), *c.friction),
-        payload=draw(keys[1], (), -c.trunk_mass, c.trunk_mass),
-        com_shift=draw(keys[2], (3,), -c.trunk_com, c.trunk_com),
-        kp=nominal.kp * draw(keys[3], joints, *c.gains),
-        kd=nominal.kd * draw(keys[4], joints, *c.gains),
+        friction=within(nominal.friction, draw(keys[0], (), *c.friction)),
+        payload=spread * draw(keys[1], (), -c.trunk_mass, c.trunk_mass),
+        com_shift=spread * draw(keys[2], (3,), -c.trunk_com, c.trunk_com),
+        kp=nominal.kp * within(1.0, draw(keys[3], joints, *c.gains)),
+        kd=nominal.kd * within(1.0, draw(keys[4], joints, *c.gains)),
     )
     most = round(c.action_delay / world.config.physics.timestep)
+    delay = jax.random.randint(keys[6], (), 0, most + 1)
     return (
         dynamics,
-        draw(keys[5], joints, -c.joint_offset, c.joint_offset),
-        jax.random.randint(keys[6], (), 0, most + 1),
+        spread * draw(keys[5], joints, -c.joint_offset, c.joint_offset),
+        jnp.round(spread * delay).astype(jnp.int32),
     )
 
 
@@ -298,16 +349,24 @@ def _drawn_mount(
     )
 
 
-def _drawn_command(world: World, key: PRNGKeyArray, kind: Int[Array, ""]) -> Float[Array, "3"]:
-    """Draw a velocity command: any direction on open ground, forward along a lane."""
+def _drawn_command(
+    world: World, key: PRNGKeyArray, kind: Int[Array, ""]
+) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
+    """Draw a velocity command, and whether the robot is steered along the lane meanwhile.
+
+    In the open it is any direction, or to stand; on a lane forward, and at times as in the open, to
+    stand as often as to go elsewhere.
+    """
     c = world.config.command
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 6)
     draw = lambda k, span: jax.random.uniform(k, (), minval=span[0], maxval=span[1])
     free = jnp.stack([draw(keys[0], c.vx), draw(keys[1], c.vy), draw(keys[2], c.yaw_rate)])
-    free = jnp.where(jax.random.uniform(keys[3]) < c.standing, jnp.zeros(3), free)
     along = jnp.stack([draw(keys[4], c.lane_vx), jnp.zeros(()), jnp.zeros(())])
-    is_open = np.isin(world.lanes.kinds, c.open_kinds)
-    return jnp.where(jnp.asarray(is_open)[kind], free, along)
+    is_open = jnp.asarray(np.isin(world.lanes.kinds, c.open_kinds))[kind]
+    stands = jax.random.uniform(keys[3]) < jnp.where(is_open, c.standing, 0.5)
+    free = jnp.where(stands, jnp.zeros(3), free)
+    is_steered = ~is_open & (jax.random.uniform(keys[5]) >= c.lane_free)
+    return jnp.where(is_steered, along, free), is_steered
 
 
 def _drawn_steps(c: config.Config, key: PRNGKeyArray, span: tuple[float, float]) -> Int[Array, ""]:

@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from cref_jax import (
     cli,
+    commands,
     evaluation,
     evaluation_page,
     exported,
@@ -33,7 +34,7 @@ from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.world import World
 
-Suite = Literal["table", "ood", "walk", "cross"]
+Suite = Literal["table", "ood", "walk", "cross", "commands"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
 
 
@@ -49,7 +50,8 @@ class Options:
     suite: Suite = "table"
     """table: the twelve cells of Table II and the failures of Table III; ood: twenty scenes in
     MuJoCo C that nobody was trained on, by the numpy runtime; cross: trials on lanes with obstacles
-    of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s"""
+    of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; commands: to stand, walk
+    at each speed, go aside, turn and stop on flat ground"""
     kind: str = "gap"
     """of the obstacles to cross: gap, stairs_up, stairs_down, platform, rough, slope, flat"""
     size: float = 0.3
@@ -91,8 +93,10 @@ def main(arguments: list[str] | None = None) -> None:
             _film(subjects[0], options, out / f"{options.film}.mp4")
             return
         started = time.monotonic()
-        judge = {"table": _table, "ood": _ood, "cross": _cross, "walk": _walk}[options.suite]
-        found = judge(subjects, options)
+        suites = {
+            "table": _table, "ood": _ood, "cross": _cross, "walk": _walk, "commands": _commands,
+        }  # fmt: skip
+        found = suites[options.suite](subjects, options)
         record = {"suite": options.suite, "seed": options.seed, **_origin(subjects)}
         record |= {"seconds": round(time.monotonic() - started, 1), **found}
         _write(out, record)
@@ -192,6 +196,17 @@ def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
     )  # fmt: skip
     print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
     return result._asdict()
+
+
+def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:
+    """Judge how commands are obeyed on level ground."""
+    policy, console = subjects[0].policy, Console()
+    with console.status("13 commands, 10 s each"):
+        physics = subjects[0].world.physics
+        found = commands.judge(policy.config, physics, policy.train, _count(options), options.seed)
+    console.print(commands.text(found))
+    console.print(commands.lines(found), highlight=False)
+    return found
 
 
 def _origin(subjects: list[Subject]) -> dict[str, Any]:

@@ -81,7 +81,11 @@ def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
         randomisation=dataclasses.replace(c.randomisation, enabled=False),
         curriculum=dataclasses.replace(c.curriculum, enabled=False),
         command=dataclasses.replace(
-            c.command, lane_vx=COMMANDS, open_kinds=(), period=(2 * seconds, 2 * seconds)
+            c.command,
+            lane_vx=COMMANDS,
+            lane_free=0.0,
+            open_kinds=(),
+            period=(2 * seconds, 2 * seconds),
         ),
         episode=dataclasses.replace(c.episode, length=seconds, stall_time=0.0),
     )

@@ -290,9 +290,10 @@ def _depth(c: Config) -> dict[str, Any]:
             "pitch_deg": c.camera.pitch,
         },
         "d_max_m": c.camera.d_max,
-        "invalid": "0, NaN, infinity and beyond d_max read as d_max, as a miss did in training",
+        "invalid": "0 and NaN are filled in from around; infinity and beyond d_max read as d_max",
+        "window": c.camera.window,
         "resize": "the pixel nearest to each cell's middle, of an image with this view",
-        "formula": "float16(depth / d_max - 0.5)",
+        "formula": "float16(nearest / d_max - 0.5), nearest: of window x window pixels around",
     }
 
 

@@ -10,7 +10,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from cref_jax import config, geometry, kinematics, terrain
 from cref_jax.kinematics import Links
@@ -85,13 +85,19 @@ def candidates(
 
         rho < r_th,    |v_1z| > eta_th,    mu_z > h_min
 
-    A window with a point nearer than half a second of the forward command does not count.
+    Points nearer than half a second of the forward command are removed, and a window has those that
+    remain, if they are `min_points`. With the gate on windows, one that has such a point goes.
     """
-    found = _windows(_heights(ground, sole, heading, c), c)
+    gate = c.gate_time * jnp.maximum(forward_command, 0.0)  # m
     x, _ = _lattice(c)
-    nearest = x[: _count(c) * c.stride : c.stride]  # of the points in each window
+    left = x[_rows(c)] >= gate
+    if c.gate == "points":
+        remain, enough = left, c.window[1] * left.sum(axis=1) >= c.min_points
+    else:
+        remain, enough = np.ones(left.shape, bool), left.all(axis=1)
+    found = _windows(_heights(ground, sole, heading, c), remain, c)
     accepted = (
-        (nearest >= c.gate_time * jnp.maximum(forward_command, 0.0))
+        enough
         & (found.roughness < c.roughness)
         & (found.verticality > c.verticality)
         & (found.z > c.min_height)
@@ -108,47 +114,54 @@ def windows(z: Float[Array, "*n X Y"], c: config.Foothold) -> Windows:
     x and y of the points are a lattice, so only the sums with z are worked out; those of squares
     are split into a part within the rows across the foot and a part between them.
     """
-    return _windows([z[..., j] for j in range(c.points[1])], c)
+    whole = np.ones((_count(c), c.window[0]), bool)
+    return _windows([z[..., j] for j in range(c.points[1])], whole, c)
 
 
-def _windows(columns: list[Float[Array, "*n X"]], c: config.Foothold) -> Windows:
-    """Return the same, from the heights of each column of points along the foot."""
+def _windows(
+    columns: list[Float[Array, "*n X"]], remain: Bool[ArrayLike, "K L"], c: config.Foothold
+) -> Windows:
+    """Return the same, from the heights of each column of points along the foot.
+
+    `remain` says which rows of each window count; one without any has no shape.
+    """
     x, y = _lattice(c)
-    length, width = c.window
+    rows, (_, width) = _rows(c), c.window
     if width != c.points[1]:
         raise ValueError(f"a window must be as wide as the buffer: {width}, not {c.points[1]}")
     # summed one by one: a reduction over 5 is slow
     row_z = sum(columns, start=jnp.zeros(())) / width
     off_row = [column - row_z for column in columns]
-    row_y = sum(off * float(at) for off, at in zip(off_row, y, strict=True))
+    row_y = sum((off * float(at) for off, at in zip(off_row, y, strict=True)), jnp.zeros(()))
+    off_square = sum((jnp.square(off) for off in off_row), jnp.zeros(()))
 
-    rows = c.stride * np.arange(_count(c))[:, None] + np.arange(length)  # of each window
-    mean_z = _summed(row_z, c) / length
-    dz = row_z[..., rows] - mean_z[..., None]
-    dx = x[:length] - x[:length].mean()
-    divisor = max(length * width - 1, 1)
-    xx, yy = width * float(np.sum(dx**2)) / divisor, length * float(np.sum(y**2)) / divisor
-    xz = width * jnp.sum(dx * dz, axis=-1) / divisor
-    yz = _summed(row_y, c) / divisor
-    within = _summed(sum(jnp.square(off) for off in off_row), c)
-    zz = (width * jnp.square(dz).sum(axis=-1) + within) / divisor
+    weight = jnp.asarray(remain, jnp.float32)
+    count = weight.sum(axis=1)
+    among = lambda of_rows: jnp.sum(weight * of_rows, axis=-1)
+    mean = lambda of_rows: among(of_rows) / jnp.maximum(count, 1.0)
+    mean_x, mean_z = mean(x[rows]), mean(row_z[..., rows])
+    dx, dz = x[rows] - mean_x[:, None], row_z[..., rows] - mean_z[..., None]
+    divisor = jnp.maximum(width * count - 1.0, 1.0)
+    xx, xz = width * among(dx * dx) / divisor, width * among(dx * dz) / divisor
+    yy, yz = count * float(np.sum(y**2)) / divisor, among(row_y[..., rows]) / divisor
+    zz = (width * among(dz * dz) + among(off_square[..., rows])) / divisor
 
     smallest, verticality = _flattest((xx, xz), (yy, yz), zz)
-    mean_x = x[:length].mean() + c.stride * c.spacing[0] * np.arange(_count(c))
     return Windows(
-        x=jnp.broadcast_to(jnp.asarray(mean_x, jnp.float32), mean_z.shape),
+        x=jnp.broadcast_to(mean_x, mean_z.shape),
         z=mean_z,
         roughness=jnp.sqrt(jnp.maximum(smallest, 0.0)),
         verticality=verticality,
     )
 
 
-def updated(before: Candidates, now: Candidates, lifted: Bool[Array, " F"]) -> Candidates:
-    """Return the new candidates of the feet that have just lifted off, and the old of the others.
+def updated(before: Candidates, now: Candidates, bears: Bool[Array, " F"]) -> Candidates:
+    """Return the new candidates of the feet that bear on the ground, and the old of the others.
 
-    A foot's candidates stay where they are in the world until its next liftoff.
+    So a foot that has lifted off has those of its last contact, where they were in the world, until
+    it is down again.
     """
-    choose = lambda new, old: jnp.where(lifted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    choose = lambda new, old: jnp.where(bears.reshape(-1, *[1] * (new.ndim - 1)), new, old)
     return jax.tree.map(choose, now, before)
 
 
@@ -187,6 +200,11 @@ def _count(c: config.Foothold) -> int:
     return (c.points[0] - c.window[0]) // c.stride + 1
 
 
+def _rows(c: config.Foothold) -> Int[np.ndarray, "K L"]:
+    """Return the rows of the buffer that each window is of."""
+    return c.stride * np.arange(_count(c))[:, None] + np.arange(c.window[0])
+
+
 def _lattice(c: config.Foothold) -> tuple[Float[np.ndarray, " X"], Float[np.ndarray, " Y"]]:
     """Return x and y of the buffer's points in the foot frame, m: x from half a spacing on."""
     x = (np.arange(c.points[0]) + 0.5) * c.spacing[0]
@@ -206,17 +224,9 @@ def _heights(
     return list((z - sole[:, 2:]).reshape(2, len(y), len(x)).swapaxes(0, 1))
 
 
-def _summed(of_rows: Float[Array, "*n X"], c: config.Foothold) -> Float[Array, "*n K"]:
-    """Return the sum over the rows of each window."""
-    one = (1,) * (of_rows.ndim - 1)
-    return jax.lax.reduce_window(
-        of_rows, 0.0, jax.lax.add, (*one, c.window[0]), (*one, c.stride), "valid"
-    )
-
-
 def _flattest(
-    along: tuple[float, Float[Array, "*n"]],
-    across: tuple[float, Float[Array, "*n"]],
+    along: tuple[Float[Array, " K"], Float[Array, "*n"]],
+    across: tuple[Float[Array, " K"], Float[Array, "*n"]],
     zz: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Return lambda_1 of the covariance [[a, 0, p], [0, b, q], [p, q, zz]] and |v_1z|.
@@ -228,8 +238,10 @@ def _flattest(
     and v_1 ~ (-p / (a - s), -q / (b - s), 1). Each pass puts h's tangent in the place of h, which
     leaves a quadratic equation for b - s; from the first on, s comes down on the root from above.
     """
-    (b, q), (a, p) = sorted((along, across), key=lambda pair: pair[0])
-    s, gap = jnp.zeros_like(zz), jnp.full_like(zz, b)  # b - s
+    swapped = along[0] < across[0]
+    b, a = jnp.minimum(along[0], across[0]), jnp.maximum(along[0], across[0])
+    q, p = (jnp.where(swapped, *pair) for pair in ((along[1], across[1]), (across[1], along[1])))
+    s, gap = jnp.zeros_like(zz), jnp.broadcast_to(b, zz.shape)  # b - s
     for _ in range(_PASSES):
         slope = jnp.square(p / (a - s))  # of h
         corner = (zz - jnp.square(p) / (a - s) + slope * s) / (1.0 + slope)

@@ -31,7 +31,7 @@ def ground_alone(world: World, state: EnvState) -> Float[Array, "H W"]:
     position, rotation = depth.pose(
         links, robot.camera, camera, state.camera_pitch, state.camera_shift
     )
-    ground = world.lanes.tile(state.level, state.kind)
+    ground = world.lanes.tile(state.level, state.kind, state.variant)
     return depth.render(ground, position, rotation, jnp.zeros((0, 7)), camera)
 
 

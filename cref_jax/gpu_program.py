@@ -25,7 +25,7 @@ from jaxtyping import PyTree
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, config, depth, hlo, lanes, learn, runs
+from cref_jax import cli, depth, hlo, lanes, learn, limits, runs
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import Backend, Body, Physics
 from cref_jax.world import World
@@ -113,7 +113,7 @@ def main() -> None:
         c = runs.composed(options.terrain, None, "gpu")
         if options.num_envs:
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=options.num_envs))
-        config.check(c)
+        limits.check(c)
         card = CARDS[options.gpu]
         prepare()
         mesh = mesh_of(card)

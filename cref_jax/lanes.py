@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
 
 import flax.struct
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 from PIL import Image
 
 from cref_jax import config, terrain
 from cref_jax.config import ConfigError
-from cref_jax.shapes import KINDS, Range, columns
+from cref_jax.shapes import KINDS, Range, columns, level_places
 from cref_jax.terrain import Terrain
 
 MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: within START
@@ -29,14 +31,17 @@ MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Atlas:
-    """All lanes in one grid: rows are levels, columns are kinds."""
+    """All lanes in one grid: rows are the variants of each level, columns are kinds."""
 
     terrain: Terrain  # the whole grid, in the coordinates of its first tile
+    places: Float[np.ndarray | Array, "rows kinds places 2"]  # m, x and height of level stretches
+    # before the last obstacle of each lane; NaN where there are none
     sizes: Float[np.ndarray | Array, "levels kinds"]  # m; m/m for a slope
     kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
     columns: tuple[int, int] = flax.struct.field(pytree_node=False)  # of the grid, along, across
     is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # each kind: level across
     turns: tuple[int, ...] = flax.struct.field(pytree_node=False)  # kinds that robots get in turn
+    variants: int = flax.struct.field(pytree_node=False, default=1)  # of each level of each kind
 
     @property
     def levels(self) -> int:
@@ -57,9 +62,24 @@ class Atlas:
         """Return the kind of lane that the robots of these numbers are on."""
         return np.asarray(self.turns)[robot % len(self.turns)]
 
-    def tile(self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""]) -> Terrain:
+    def tile(
+        self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""], variant: Int[ArrayLike, ""] = 0
+    ) -> Terrain:
         """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""
-        return terrain.tile(self.terrain, self.columns, level, kind)
+        row = level * self.variants + variant
+        return terrain.tile(self.terrain, self.columns, row, kind)
+
+    def level_place(
+        self,
+        kind: Int[Array, ""],
+        level: Int[Array, ""],
+        variant: Int[Array, ""],
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Draw where a robot may start on a lane, x and height, m; NaN where at its start alone."""
+        of_lane = jnp.asarray(self.places)[level * self.variants + variant, kind]
+        x, z = of_lane[jax.random.randint(key, (), 0, of_lane.shape[0])]
+        return x, z
 
 
 def build(c: config.Terrain) -> Atlas:
@@ -75,8 +95,9 @@ def build(c: config.Terrain) -> Atlas:
     numbers = _numbers(c.name)
     numbers = {kind: n._replace(shape=n.practice) for kind, n in numbers.items()}
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
-    atlas = _atlas(c, numbers, sizes, [c.seed] * c.levels)
-    return atlas.replace(turns=_turns(c.name, atlas.kinds))
+    seeds = [c.seed + variant for variant in range(c.variants)] * c.levels
+    atlas = _atlas(c, numbers, np.repeat(sizes, c.variants, axis=0), seeds)
+    return atlas.replace(sizes=sizes, turns=_turns(c.name, atlas.kinds), variants=c.variants)
 
 
 def single(c: config.Terrain, kind: str, size: float) -> Atlas:
@@ -170,10 +191,15 @@ def _atlas(
             drawn_by = [seeds[level], zlib.crc32(kind.encode()), round(1e4 * size)]
             rng = np.random.default_rng(drawn_by)
             heights[level, :, k] = KINDS[kind].heights(c, float(size), n.shape, rng)
+    places = [
+        [level_places(lane[:, across // 2], c.cell) for lane in of_level]
+        for of_level in heights.swapaxes(1, 2)
+    ]
     grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
     origin = (0.0, -0.5 * across * c.cell)
     return Atlas(
         terrain=terrain.from_heights(grid, c.cell, origin, lane=(along, across)),
+        places=np.array(places, np.float32),
         sizes=sizes,
         kinds=tuple(numbers),
         columns=(along, across),
@@ -184,8 +210,10 @@ def _atlas(
 
 def _check_lane(c: config.Terrain) -> None:
     """Refuse lanes of no extent."""
-    if not c.cell > 0.0 or min(c.lane_length, c.lane_width, c.levels) <= 0:
-        raise ConfigError("a terrain's cell, lane_length, lane_width and levels must be above zero")
+    if not c.cell > 0.0 or min(c.lane_length, c.lane_width, c.levels, c.variants) <= 0:
+        raise ConfigError(
+            "a terrain's cell, lane_length, lane_width, levels and variants must be above zero"
+        )
 
 
 def _check_columns(shape: tuple[int, int], what: str) -> None:
@@ -322,7 +350,8 @@ def _own_map(path: Path) -> Atlas:
     origin = (MAP_START - file.start[0], -file.start[1])
     grid = terrain.from_heights(heights.astype(np.float32), file.cell, origin)
     is_profile = bool((heights == heights[:, :1]).all())
-    return Atlas(grid, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,), (0,))
+    nowhere = np.full((1, 1, 1, 2), np.nan, np.float32)
+    return Atlas(grid, nowhere, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,), (0,))
 
 
 def _array(path: Path) -> np.ndarray:

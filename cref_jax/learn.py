@@ -17,7 +17,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, PyTree
 
-from cref_jax import ppo, rollout
+from cref_jax import ppo, ramp, rollout
+from cref_jax.ramp import Ramp
 from cref_jax.world import World
 
 Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
@@ -32,6 +33,7 @@ class RunState:
 
     train: ppo.TrainState
     robots: rollout.Robots
+    ramp: Ramp
 
 
 def mesh_of(count: int = 1) -> Mesh:
@@ -61,7 +63,11 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     params = rollout.initial_params(c, joints, robots, key_params)
     sizes = seen.proprioception.shape[-1], seen.privileged.shape[-1]
     train = ppo.initial_state(params, *sizes, c.ppo)
-    return RunState(jax.lax.with_sharding_constraint(train, NamedSharding(mesh, P())), robots)
+    whole = NamedSharding(mesh, P())
+    train, growing = jax.lax.with_sharding_constraint(
+        (train, ramp.begun(c.randomisation)), (whole, whole)
+    )
+    return RunState(train, robots, growing)
 
 
 def shapes(world: World, mesh: Mesh) -> RunState:
@@ -94,9 +100,10 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         world: World, state: RunState, key: Array
     ) -> tuple[RunState, ppo.Losses, rollout.Trace]:
         key_act, key_update = jax.random.split(_own(key))
-        robots, experience, trace = rollout.collect(world, nets, state.train, state.robots, key_act)
+        robots = rollout.hardened(state.robots, state.ramp.share)
+        robots, experience, trace = rollout.collect(world, nets, state.train, robots, key_act)
         train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions, AXIS)
-        return RunState(train, robots), losses, trace
+        return state.replace(train=train, robots=robots), losses, trace
 
     parts = partition(world)
     shared = jax.shard_map(
@@ -107,7 +114,10 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         check_vma=False,
     )
     std = jnp.exp(state.train.params.actor["params"]["log_std"])
+    std = jnp.maximum(std, c.network.min_std)
     state, losses, trace = shared(world, state, key)
+    falls = trace.ending.terminated.mean() * (60.0 / c.physics.control_period)
+    state = state.replace(ramp=ramp.advanced(state.ramp, falls, c.randomisation))
     samples = state.train.iteration * (c.run.num_envs * c.ppo.horizon)
     log = {
         **_episodes(trace, world.lanes.kinds, c.physics.control_period),
@@ -116,13 +126,15 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
         "train/action_std": std.mean(),
         "train/samples": samples.astype(jnp.float32),
+        "train/randomisation": state.ramp.share,
     }
     return state, log
 
 
 def partition(world: World) -> RunState:
     """Return how a run's state is shared out: the robots are, and what is learned is not."""
-    return RunState(train=P(), robots=rollout.partition(AXIS, world.config.network.variant))
+    robots = rollout.partition(AXIS, world.config.network.variant)
+    return RunState(train=P(), robots=robots, ramp=P())
 
 
 def _own(key: Array) -> Array:

@@ -201,7 +201,8 @@ class Actor(nn.Module):
             x = jnp.concatenate([x, jnp.where(seen, found, 0.0)], axis=-1)
         f = self.fusion(x)
         gru, y, gate = self.recurrent_fusion(carry.gru, f, begins)
-        output = Output(self.action_head(y), self.log_std, velocity, y, gate, attention)
+        log_std = jnp.maximum(self.log_std, math.log(max(self.c.min_std, 1e-9)))
+        output = Output(self.action_head(y), log_std, velocity, y, gate, attention)
         return Carry(*lstm, gru), output
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from cref_jax import config, geometry, terrain
 
@@ -62,10 +62,13 @@ def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"], joints: int) -> M
     )
 
 
-def with_noise(clean: Motion, c: config.Randomisation, key: PRNGKeyArray) -> Motion:
-    """Return the motion with uniform sensor noise; the velocity, which no sensor has, stays."""
+def with_noise(
+    clean: Motion, c: config.Randomisation, spread: Float[ArrayLike, ""], key: PRNGKeyArray
+) -> Motion:
+    """Return the motion with a share of the uniform sensor noise; no sensor has the velocity."""
     keys = jax.random.split(key, 4)
-    noise = lambda k, x, width: x + jax.random.uniform(k, x.shape, minval=-width, maxval=width)
+    draw = lambda k, x, width: jax.random.uniform(k, x.shape, minval=-width, maxval=width)
+    noise = lambda k, x, width: x + spread * draw(k, x, width)
     return clean._replace(
         angular_velocity=noise(keys[0], clean.angular_velocity, c.noise_angular_velocity),
         gravity=noise(keys[1], clean.gravity, c.noise_gravity),
@@ -98,14 +101,35 @@ def height_scan(
 ) -> Float[Array, " M"]:
     """m_t: height of the base above a grid of ground points around it, m, less the nominal 0.6."""
     x, y = np.meshgrid(np.linspace(*c.x), np.linspace(*c.y), indexing="ij")
-    grid = (x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+    return _clearance(ground, qpos, x.ravel(), y.ravel(), c)
+
+
+def fine_row(
+    ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
+) -> Float[Array, " A"]:
+    """Return the same along a row straight ahead, fine enough to place the edge of a tread."""
+    x = np.linspace(*c.ahead)
+    return _clearance(ground, qpos, x, np.zeros_like(x), c)
+
+
+def _clearance(
+    ground: terrain.Terrain,
+    qpos: Float[Array, " Q"],
+    x: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, " N"],
+    c: config.Scan,
+) -> Float[Array, " N"]:
+    grid = (x.astype(np.float32), y.astype(np.float32))
     by_x, by_y = geometry.turned_yaw(geometry.yaw(qpos[3:7]), *grid)
     clearance = qpos[2] - terrain.height_under(ground, qpos[0] + by_x, qpos[1] + by_y)
     return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
 
 
 def privileged(
-    clean: Float[Array, " O"], velocity: Float[Array, "3"], scan: Float[Array, " M"]
+    clean: Float[Array, " O"],
+    velocity: Float[Array, "3"],
+    hidden: Float[Array, " H"],
+    scan: Float[Array, " M"],
 ) -> Float[Array, " S"]:
-    """s_t = [o^p_t, v_t, m_t] without sensor noise, Eq. 3."""
-    return jnp.concatenate([clean, velocity, scan])
+    """s_t = [o^p_t, v_t, hidden, m_t] without sensor noise; Eq. 3 has no hidden."""
+    return jnp.concatenate([clean, velocity, hidden, scan])

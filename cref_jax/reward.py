@@ -34,8 +34,9 @@ class Snapshot(NamedTuple):
     foot_velocity: Float[Array, "F 3"]  # m/s
     foot_velocity_before: Float[Array, "F 3"]  # m/s, one control step ago
     foot_force: Float[Array, "F 3"]  # N, mean over the control step
-    first_contact: Bool[Array, " F"]  # the foot has come down in this step
-    air_time: Float[Array, " F"]  # s, length of the aerial phase that it ended
+    first_contact: Bool[Array, " F"]  # the foot's touchdown was confirmed in this step
+    air_time: Float[Array, " F"]  # s, length of the swing that it ended
+    last_air_time: Float[Array, " F"]  # s, of each foot's last swing, this one included
     foothold_distance: Float[Array, " F"]  # m, d_xz to the nearest candidate; inf: there is none
     unsupported: Int[Array, " F"]  # samples of the sole that are over nothing
     since_single: Float[Array, ""]  # s since exactly one foot touched
@@ -142,6 +143,20 @@ def feet_air_time(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, "
     return jnp.sum(s.first_contact * (c.air_time_target - s.air_time))
 
 
+def air_time_variance(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """I_first of any foot times the variance of the feet's last air times, s^2; not in Table I.
+
+    It is 0 until both feet have swung.
+    """
+    both = (s.last_air_time > 0.0).all()
+    return jnp.where(both & s.first_contact.any(), jnp.var(s.last_air_time), 0.0)
+
+
+def foot_up_when_standing(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """I_stand times the number of feet that do not touch; not in Table I."""
+    return is_standing(s.command, c) * jnp.sum(~is_touching(s.foot_force, c)).astype(jnp.float32)
+
+
 def foot_slip(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """Sum over feet of I(||F|| > 5) ||v_xyz||; the table says xyz, although its name says slip."""
     touching = is_touching(s.foot_force, c)
@@ -205,6 +220,8 @@ TERMS: dict[str, Term] = {
         action_rate,
         action_smoothness,
         feet_air_time,
+        air_time_variance,
+        foot_up_when_standing,
         foot_slip,
         foot_impact_acceleration,
         foot_impact_velocity,
@@ -216,7 +233,8 @@ TERMS: dict[str, Term] = {
     )
 }
 
-EVENTS = ("foothold_placement", "feet_air_time")  # are not 0 in the step of a touchdown alone
+# not 0 in the step of a touchdown alone
+EVENTS = ("foothold_placement", "feet_air_time", "air_time_variance")
 
 
 def total(
@@ -224,15 +242,17 @@ def total(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the step's reward, and each weighted term under its name for the log.
 
-    The sum is scaled by the control period, touchdowns by their own time instead, and cut at 0 from
-    below, as the configuration says.
+    The sum is scaled by the control period, touchdowns by their own time instead. The sum of the
+    other terms is cut at 0 from below; touchdowns are not: cut off, a short step would cost nothing
+    and one long and one short step would be worth more than two equal ones. They count for nothing
+    while the robot is told to stand.
     """
     parts = {name: getattr(c.weights, name) * term(s, c, robot) for name, term in TERMS.items()}
-    if c.times_dt:
-        parts |= {name: parts[name] * c.event_time / s.control_period for name in EVENTS}
-    reward = sum(parts.values(), start=jnp.zeros(()))
-    if c.times_dt:
-        reward = reward * s.control_period
+    walking = 1.0 - is_standing(s.command, c)
+    worth = walking * (c.event_time / s.control_period if c.times_dt else 1.0)
+    parts |= {name: parts[name] * worth for name in EVENTS}
+    events = sum((parts[name] for name in EVENTS), start=jnp.zeros(()))
+    dense = sum((x for name, x in parts.items() if name not in EVENTS), start=jnp.zeros(()))
     if c.clip_at_zero:
-        reward = jnp.maximum(reward, 0.0)
-    return reward, parts
+        dense = jnp.maximum(dense, 0.0)
+    return (dense + events) * (s.control_period if c.times_dt else 1.0), parts

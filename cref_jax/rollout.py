@@ -158,6 +158,12 @@ def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
     )
 
 
+def hardened(robots: Robots, share: Float[Array, ""]) -> Robots:
+    """Return the robots with this share of all that is randomised from the next draw on."""
+    spread = jnp.broadcast_to(share, robots.begins.shape)
+    return robots.replace(env=robots.env.replace(spread=spread))
+
+
 def act(nets: Networks, train: ppo.TrainState, robots: Robots) -> tuple[Memory, network.Output]:
     """Return the policy's memory after this step and its outputs, [1, E, ...].
 

@@ -17,6 +17,8 @@ from cref_jax.config import ConfigError
 
 START = 1.5  # m, level ground at the start; assumed: the robot is put down at 0.5 to 1 m
 END = 1.0  # m, level ground at the end, at least; assumed
+PLACES = 32  # of a lane, that robots may start from; assumed
+LEVEL = 0.45  # m, level ground before and behind such a place; wider than any trench, so not in one
 
 Heights = Float[np.ndarray, "X Y"]  # m
 Range = tuple[float, float]  # from, to; uniform
@@ -75,6 +77,20 @@ class Platform:
     count: tuple[int, int]  # from, to: as many as the lane has room for
     length: Range  # m, of a box
     landing: Range  # m, before each box; START at least before the first
+
+
+def level_places(profile: Float[np.ndarray, " X"], cell: float) -> Float[np.ndarray, "places 2"]:
+    """Return x and height of PLACES level stretches of a lane with this profile, in even spread."""
+    reach = round(LEVEL / cell)
+    stretch = np.lib.stride_tricks.sliding_window_view(profile, 2 * reach + 1)
+    is_level = np.ptp(stretch, axis=1) == 0.0
+    column = np.flatnonzero(is_level) + reach
+    changes = np.flatnonzero(np.diff(profile))
+    column = column[column < changes[-1]] if changes.size else column[:0]
+    if not column.size:
+        return np.full((PLACES, 2), np.nan)
+    column = column[np.linspace(0, column.size - 1, PLACES).astype(int)]
+    return np.stack([(column + 0.5) * cell, profile[column]], axis=1)
 
 
 def flat(c: config.Terrain, size: float, shape: Flat, rng: np.random.Generator) -> Heights:

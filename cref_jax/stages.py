@@ -34,7 +34,7 @@ def step_physics(world: World, robots: rollout.Robots) -> Any:
     target = jnp.asarray(world.physics.robot.nominal_pose)
 
     def one(state: env.EnvState, body: Any) -> Any:
-        ground = world.lanes.tile(state.level, state.kind)
+        ground = world.lanes.tile(state.level, state.kind, state.variant)
         return world.physics.step(
             ground, body, jnp.stack([target, target]), state.delay, state.dynamics
         )[0]
@@ -47,7 +47,7 @@ def query_terrain(world: World, robots: rollout.Robots) -> Any:
     """Ask for the tangent planes of all spheres, as often as a control step does."""
 
     def one(state: env.EnvState, body: Any) -> Any:
-        return world.physics.planes(world.lanes.tile(state.level, state.kind), body)
+        return world.physics.planes(world.lanes.tile(state.level, state.kind, state.variant), body)
 
     def query(body: Any, _: None) -> tuple[Any, None]:
         position, rotation = jax.vmap(one)(robots.env, body)
@@ -76,7 +76,7 @@ def find_footholds(world: World, robots: rollout.Robots) -> Any:
     c = world.config.foothold
 
     def one(state: env.EnvState, body: Any) -> Any:
-        ground = world.lanes.tile(state.level, state.kind)
+        ground = world.lanes.tile(state.level, state.kind, state.variant)
         soles = foothold.soles(world.physics.links(body), world.physics.robot)
         near = foothold.distance(state.candidates, soles.centre)
         ahead = foothold.candidates(ground, soles.centre, soles.heading, state.command[0], c)

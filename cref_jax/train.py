@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, config, evaluation, exported, learn, processes, runs
+from cref_jax import cli, evaluation, exported, learn, limits, processes, runs
 from cref_jax.checkpoint import Checkpoints, lock
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName, resolve_engine
@@ -24,6 +24,7 @@ from cref_jax.progress import Reporter
 from cref_jax.world import World
 
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
+NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings
 MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
 
 Device = Literal["auto", "cpu", "gpu"]
@@ -108,7 +109,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     c = _with_short_options(command.settings, command.options)
     if command.options.init:
         c = _with_init(c, command.options)
-    config.check(c)
+    limits.check(c)
     return dataclasses.replace(command.options, device=options.device), c
 
 
@@ -325,7 +326,7 @@ def _with_init(c: Config, options: Options) -> Config:
         raise ConfigError("give --init or --resume, not both")
     theirs, ours = exported.read_config(options.init or Path()).network, c.network
     for name, value in dataclasses.asdict(theirs).items():
-        if name not in ("critic", "initial_std") and value != getattr(ours, name):
+        if name not in NOT_OF_THE_ACTOR and value != getattr(ours, name):
             raise ConfigError(
                 f"--init {options.init} has another network: {name} is {value}, and here "
                 f"{getattr(ours, name)}; set --network.{name.replace('_', '-')}"

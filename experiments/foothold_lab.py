@@ -189,7 +189,7 @@ def look(world: World, moment: Moment) -> Step:
         base_x=state.body.qpos[:, 0],
         sole=soles,
         touchdown=moment.outcome.measures.touchdown,
-        air_time=moment.robots.env.air_time,
+        air_time=moment.robots.env.gait.air_time,
         distance=moment.outcome.measures.foothold_distance,
         foot_riser=of(spheres.foot >= 0),
         shank_riser=of(spheres.foot < 0),

@@ -132,7 +132,7 @@ def look(world: World, moment: Moment) -> Step:
     low, high = jnp.percentile(gate, jnp.array([10.0, 90.0]), axis=1)
     return Step(
         gate=jnp.stack([gate.mean(axis=1), low, high], axis=1),
-        airborne=state.air_time > 0.0,
+        airborne=~state.gait.down,
         pose=state.body.qpos[:, :7],
     )
 

@@ -20,7 +20,7 @@ C = config.override(
     },
 )
 ROBOTS = 4
-OBSERVED = {"state": 45, "privileged_state": 45 + 3 + 153}
+OBSERVED = {"state": 45, "privileged_state": 45 + 3 + 64 + 153}
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cref_jax import config
+from cref_jax import config, limits
 from cref_jax.config import Config, ConfigError
 
 SOURCE = Path(config.__file__).read_text()
@@ -57,8 +57,8 @@ def test_a_file_that_is_missing_or_broken_is_named(tmp_path: Path):
 def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
     few = config.override(Config(), {"run": {"num_envs": 3}, "ppo": {"minibatches": 4}})
     with pytest.raises(ConfigError, match="take 4"):
-        config.check(few)
-    config.check(Config())
+        limits.check(few)
+    limits.check(Config())
 
 
 def test_the_horizon_is_half_a_second_and_a_control_step_20_ms():

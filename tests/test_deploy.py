@@ -2,11 +2,12 @@ import ast
 import threading
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from random_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
-from cref_jax import config, deploy, vectors
+from cref_jax import config, deploy, depth, vectors
 from cref_jax.deploy import Status
 
 PERIOD = 0.02
@@ -81,6 +82,16 @@ def test_what_is_beyond_reach_reads_as_the_far_plane_and_millimetres_as_metres(r
     assert np.abs(tokens(robot, frame()) - tokens(robot, far)).max() > 1e-3
     millimetres = np.where(np.isfinite(depth), 1000 * depth, 60_000).astype(np.uint16)
     np.testing.assert_array_equal(tokens(robot, millimetres), tokens(robot, far))
+
+
+def test_a_window_shows_the_nearest_of_the_pixels_around_as_training_did():
+    manifest, arrays = contents(policy("full", SMALL))
+    manifest["depth"]["window"] = 3
+    depth_image = np.random.default_rng(1).uniform(0.3, 2.9, (48, 64)).astype(np.float32)
+    nearest = np.asarray(depth.nearest_around(jnp.asarray(depth_image), 3))
+    np.testing.assert_allclose(
+        tokens(deploy.Policy(manifest, arrays), depth_image), tokens(runtime(), nearest), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan, -1.0])

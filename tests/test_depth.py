@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy.ndimage
 
 from cref_jax import config, depth, kinematics, lanes, robot, terrain
 
@@ -387,6 +388,13 @@ def test_cameras_on_different_tiles_share_one_grid():
 def test_a_normalised_image_lies_around_zero():
     image = jnp.array([[0.0, 1.5, 3.0]])
     np.testing.assert_allclose(depth.normalise(image, CAMERA), [[-0.5, 0.0, 0.5]])
+
+
+@pytest.mark.parametrize("window", [1, 3, 5])
+def test_a_pixel_is_the_nearest_of_those_around_it(window):
+    image = np.random.default_rng(0).uniform(0.2, 3.0, (48, 64)).astype(np.float32)
+    expected = scipy.ndimage.minimum_filter(image, window, mode="constant", cval=np.inf)
+    np.testing.assert_array_equal(depth.nearest_around(jnp.asarray(image), window), expected)
 
 
 def due(steps, camera=CAMERA, period=0.02):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sample import ROBOTS, C, assert_equal, one, put
 
-from cref_jax import config, env, foothold, observation, reward
+from cref_jax import config, env, foothold, gait, observation, reward
 from cref_jax.physics import Physics
 
 LENGTH = C.terrain.lane_length
@@ -116,7 +116,8 @@ def test_an_encoders_offset_is_seen_and_shifts_what_is_reached(world, step, robo
     np.testing.assert_allclose(
         seen.proprioception[part] - true.proprioception[part], shift, atol=1e-6
     )
-    np.testing.assert_array_equal(seen.privileged, true.privileged)  # the critic sees the joints
+    # the critic sees the joints as they are, and the offsets
+    assert (seen.privileged != true.privileged).sum() == (shift != 0.0).sum()
 
 
 def test_the_same_key_gives_the_same_trajectory_and_another_one_another(world, step, robots):
@@ -152,37 +153,44 @@ def lived(world, state, force):
     """Return the state a step later and its snapshot, had it ended with this force on the feet."""
     links = world.physics.links(state.body)
     soles = foothold.soles(links, world.physics.robot)
-    snapshot = env._snapshot(world, state, state.body, links, soles, force, state.action)
+    touching = reward.is_touching(force, C.reward)
+    feet, swings = gait.advanced(state.gait, touching, C.physics.control_period, C.reward.debounce)
+    state = state.replace(gait=feet)
+    snapshot = env._snapshot(world, state, state.body, links, soles, force, swings, state.action)
     return env._lived(world, state, state.body, soles, snapshot), snapshot
 
 
-def test_candidates_are_found_at_liftoff_and_judged_at_touchdown(world, robots):
-    """The left foot: on the ground, up, up, down; the command is 0.6 m/s, so the gate is 0.3 m."""
+def test_candidates_are_those_of_the_last_contact_and_judged_at_touchdown(world, robots):
+    """The left foot: down, up, a scuff, up, down; the command is 0.6 m/s, so the gate is 0.3 m."""
     state = one(robots).replace(command=jnp.array([0.6, 0.0, 0.0]))
     live = jax.jit(lambda s, force: lived(world, s, force))
     up, down = (jnp.array([[0.0, 0.0, left], [0.0, 0.0, 200.0]]) for left in (0.0, 200.0))
+    assert not state.candidates.accepted.any()
     standing, _ = live(state, down)
-    assert not standing.candidates.accepted.any()
-    lifted, _ = live(standing, up)
-    assert lifted.candidates.accepted.any(axis=1).tolist() == [True, False]
-    moved = put(lifted, x=lifted.body.qpos[0] + 0.44)
-    swung, snapshot = live(moved, up)
-    np.testing.assert_array_equal(swung.candidates.x, lifted.candidates.x)
-    np.testing.assert_array_equal(swung.candidates.origin, lifted.candidates.origin)
-    # level ground; the nearest window that is past 0.3 m begins with the sample at 0.33 m, and its
-    # mean is 0.11 m further: the foot, turned a little from the lane, is about 0.44 m ahead
-    assert snapshot.foothold_distance[0] < 0.02 and jnp.isinf(snapshot.foothold_distance[1])
-    _, landed = live(swung, down)
+    assert standing.candidates.accepted.any(axis=1).tolist() == [True, True]
+    swung = standing
+    for k, force in enumerate((up, up, down, up)):
+        swung, snapshot = live(put(swung, x=standing.body.qpos[0] + 0.11 * (k + 1)), force)
+        assert not snapshot.first_contact.any()
+        left = jax.tree.map(lambda x: x[0], (swung.candidates, standing.candidates))
+        jax.tree.map(np.testing.assert_array_equal, *left)
+    # level ground; the nearest window of points past 0.3 m has its mean at 0.32 m, and each 4 cm
+    # further there is another: the foot, turned a little from the lane, is about 0.44 m ahead
+    assert snapshot.foothold_distance[0] < 0.02
+    touched, first = live(swung, down)
+    assert not first.first_contact.any()  # it may be a scuff, too
+    _, landed = live(touched, down)
     assert landed.first_contact.tolist() == [True, False]
+    assert float(landed.air_time[0]) == pytest.approx(5 * 0.02)
     placed = reward.foothold_placement(landed, C.reward, world.physics.robot)
     assert float(placed) > np.exp(-0.02 / 0.08)
 
 
 def test_contacts_time_the_phases_of_a_gait(world, robots):
-    """Five steps of 20 ms: both feet, right, right, both, left."""
+    """Seven steps of 20 ms: both feet, thrice the right one, twice both, the left one."""
     state = one(robots)
     live = jax.jit(lambda s, force: lived(world, s, force))
-    on_ground = [(1, 1), (0, 1), (0, 1), (1, 1), (1, 0)]
+    on_ground = [(1, 1), (0, 1), (0, 1), (0, 1), (1, 1), (1, 1), (1, 0)]
     first, ended, air, since = [], [], [], []
     for touching in on_ground:
         # 5 N and less do not count
@@ -190,15 +198,15 @@ def test_contacts_time_the_phases_of_a_gait(world, robots):
         state, snapshot = live(state, force)
         first.append(snapshot.first_contact.tolist())
         ended.append(snapshot.air_time.tolist())
-        air.append(state.air_time.tolist())
+        air.append(state.gait.air_time.tolist())
         since.append(float(snapshot.since_single))
-    # the start counts as on the ground, so only the left foot comes down, in the fourth step
-    assert first == [[False] * 2, [False] * 2, [False] * 2, [True, False], [False] * 2]
-    # off the ground in steps 2 and 3: the contact comes within 0.06 s of leaving
-    np.testing.assert_allclose(ended[3][0], 0.06, atol=1e-6)
-    expected = [[0, 0], [0.02, 0], [0.04, 0], [0, 0], [0, 0.02]]
-    np.testing.assert_allclose(air, expected, atol=1e-6)
-    np.testing.assert_allclose(since, [0.02, 0, 0, 0.02, 0], atol=1e-6)
+    # the start counts as on the ground, so only the left foot comes down: confirmed in step 6
+    assert first == [[k == 5, False] for k in range(7)]
+    # off the ground in steps 2 to 4: the contact comes within 0.08 s of leaving
+    np.testing.assert_allclose(ended[5][0], 0.08, atol=1e-6)
+    left = [0, 0, 0.04, 0.06, 0.08, 0, 0]  # up from the second step without contact
+    np.testing.assert_allclose(air, [[x, 0] for x in left], atol=1e-6)
+    np.testing.assert_allclose(since, [0.02, 0, 0, 0, 0.02, 0.04, 0], atol=1e-6)
 
 
 def test_the_support_stays_at_its_last_height_while_both_feet_are_in_the_air(world, robots):

@@ -52,6 +52,50 @@ def test_a_robot_starts_standing_on_its_lane(world, resets):
     np.testing.assert_array_equal(resets.step, 0)
 
 
+def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obstacle(world, resets):
+    c = config.override(C, {"episode": {"start_anywhere": 0.5}})
+    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
+    keys = jax.random.split(jax.random.key(3), 512)
+    state = reset(world.replace(config=c), keys, resets.kind, jnp.full(512, 2))
+    x, kinds = np.asarray(state.body.qpos[:, 0]), np.array(world.lanes.kinds)[state.kind]
+    away = x > 1.1  # m; the level start is 1.5 m long
+    assert not away[(kinds == "flat") | (kinds == "rough")].any()  # nothing lies ahead there
+    assert 0.15 < away[kinds == "gap"].mean() < 0.6  # half of the places are at the start, too
+
+    def ground(state, offset):
+        place = state.body.qpos[:2] + jnp.array([offset, 0.0])
+        tile = world.lanes.tile(state.level, state.kind, state.variant)
+        return terrain.height_at(tile, place)
+
+    under, *around = (jax.vmap(ground, (0, None))(state, by) for by in (0.0, -0.4, 0.4))
+    for there in around:
+        np.testing.assert_array_equal(under[away], there[away])
+    assert float(jnp.abs(under[away]).max()) > 0.15  # on landings and boxes, too
+    assert float(under[kinds == "gap"].min()) == 0.0  # not in a trench
+    rise = state.body.qpos[:, 2] - under
+    np.testing.assert_allclose(rise, resets.body.qpos[:, 2].mean(), atol=0.02)
+
+
+def test_half_of_the_randomisation_is_half_as_wide(world, resets):
+    kinds, levels = resets.kind, resets.level
+    keys = jax.random.split(jax.random.key(3), 512)  # those of `resets`
+    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, None)))
+    nominal = world.physics.nominal_dynamics()
+    for share in (0.0, 0.5):
+        state = reset(world, keys, kinds, levels, jnp.float32(share))
+        for part, whole, middle in zip(
+            *map(jax.tree.leaves, (state.dynamics, resets.dynamics, nominal)), strict=True
+        ):
+            np.testing.assert_allclose(
+                part, middle + share * (whole - middle), rtol=1e-4, atol=1e-5
+            )
+        for name in ("joint_offset", "camera_pitch", "camera_shift"):
+            np.testing.assert_allclose(
+                getattr(state, name), share * getattr(resets, name), rtol=1e-5
+            )
+        assert int(state.delay.max()) == {0.0: 0, 0.5: 2}[share]
+
+
 def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, resets):
     r, nominal = C.randomisation, world.physics.nominal_dynamics()
     drawn = resets.dynamics
@@ -82,10 +126,16 @@ def test_without_randomisation_every_robot_is_the_nominal_one(world):
 # The command
 
 
-def test_on_a_lane_the_command_goes_forward_and_on_open_ground_anywhere(world, resets):
+def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, resets):
     c, command = C.command, np.asarray(resets.command)
     is_open = np.asarray(resets.kind) == world.lanes.kinds.index("flat")
-    along = command[~is_open]
+    is_steered = np.asarray(resets.is_steered)
+    assert not is_steered[is_open].any()
+    assert 0.85 < is_steered[~is_open].mean() < 0.95  # all but a tenth
+    elsewhere = command[~is_open & ~is_steered]
+    assert 0.3 < (elsewhere == 0.0).all(axis=1).mean() < 0.7  # a half of those stands
+    assert (np.abs(elsewhere[:, 1:]).max(axis=0) > [0.1, 0.3]).all()
+    along = command[is_steered]
     assert c.lane_vx[0] <= along[:, 0].min() and along[:, 0].max() <= c.lane_vx[1]
     np.testing.assert_array_equal(along[:, 1:], 0.0)
     free = command[is_open]
@@ -108,17 +158,17 @@ def pushed(world, state, key):
 @pytest.mark.parametrize(
     ("y", "heading", "expected"),
     [
-        (0.5, 0.0, -0.25),  # 0.5 rad/m * 0.5 m to the right, by 1 rad/s a radian
-        (0.5, 0.2, -0.45),  # and 0.2 rad more, as it heads to the left
-        (0.0, -0.3, 0.3),
-        (3.0, 0.05, -0.55),  # no more than 0.5 rad off the lane's direction, 0.05 to be undone
+        (0.1, 0.0, -0.3),  # 1.5 rad/m * 0.1 m to the right, by 2 rad/s a radian
+        (0.1, 0.1, -0.5),  # and 0.1 rad more, as it heads to the left
+        (0.0, -0.2, 0.4),
+        (3.0, -0.4, -0.2),  # no more than 0.5 rad off the lane's direction, 0.1 to be added
         (3.0, 0.3, -0.6),  # the limit of the yaw rate
         (0.0, 3.1, -0.6),  # the short way round
         (0.0, -3.1, 0.6),
     ],
 )
 def test_a_robot_on_a_lane_is_steered_to_its_middle(world, robots, y, heading, expected):
-    state = on("gap", one(robots)).replace(command_left=jnp.int32(9))
+    state = on("gap", one(robots)).replace(command_left=jnp.int32(9), is_steered=jnp.array(True))
     about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.float32(heading))
     steered = commanded(world, put(state, y=y, rotation=about_z))
     np.testing.assert_allclose(steered.command[2], expected, atol=1e-5)
@@ -127,6 +177,7 @@ def test_a_robot_on_a_lane_is_steered_to_its_middle(world, robots, y, heading, e
 
 def test_whoever_obeys_the_steering_ends_in_the_middle_of_the_lane(world, robots):
     state = on("gap", one(robots)).replace(command=jnp.array([0.5, 0.0, 0.0]))
+    state = state.replace(is_steered=jnp.array(True))
 
     def walk(pose, _):
         x, y, heading = pose
@@ -142,11 +193,24 @@ def test_whoever_obeys_the_steering_ends_in_the_middle_of_the_lane(world, robots
 
 def test_on_open_ground_the_yaw_rate_is_the_drawn_one(world, robots):
     state = on("flat", one(robots))
-    state = put(state, y=0.5).replace(command=jnp.array([0.5, 0.1, 0.7]), command_left=jnp.int32(9))
+    state = put(state, y=0.5).replace(
+        command=jnp.array([0.5, 0.1, 0.7]), command_left=jnp.int32(9), is_steered=jnp.array(False)
+    )
     after = commanded(world, state)
     np.testing.assert_array_equal(after.command, state.command)
     # |(0.5, 0.1)| * 0.02 s
     np.testing.assert_allclose(after.commanded - state.commanded, 0.51 * PERIOD, rtol=1e-3)
+
+
+def test_a_robot_that_is_told_to_stand_or_to_turn_on_a_lane_is_not_steered(world, robots):
+    state = put(on("gap", one(robots)), y=0.5)
+    for command in ([0.0, 0.0, 0.0], [0.0, 0.0, 0.8], [0.3, -0.2, 0.1]):
+        told = state.replace(
+            command=jnp.array(command), command_left=jnp.int32(9), is_steered=jnp.array(False)
+        )
+        after = commanded(world, told)
+        np.testing.assert_array_equal(after.command, told.command)
+        assert float(after.commanded) == float(told.commanded)  # no way along the lane is asked for
 
 
 def test_a_new_command_is_drawn_only_when_it_is_due(world, robots):
@@ -261,6 +325,13 @@ def test_a_robot_that_stands_in_its_lane_has_stalled(causes, robots, kind, step,
     assert causes(on(kind, state)) == expected
 
 
+def test_who_was_told_to_stand_in_between_has_not_stalled(causes, robots):
+    # 2 m asked for in 5 s is 0.4 m/s throughout, the slowest command; 1.8 m is not
+    state = put(one(robots), x=2.0).replace(step=jnp.int32(500), mark=jnp.array([2.0, 4.0]))
+    assert causes(on("gap", state.replace(commanded=jnp.float32(6.0)))) == {"stalled"}
+    assert causes(on("gap", state.replace(commanded=jnp.float32(5.8)))) == set()
+
+
 def test_a_look_is_noted(world, robots):
     state = put(one(robots), x=3.0).replace(commanded=jnp.float32(2.5))
     for step, expected in ((250, [3.0, 2.5]), (251, np.asarray(state.mark))):
@@ -304,9 +375,22 @@ def test_a_rank_is_won_and_lost(world, robots, walked, commanded, level, cause, 
     assert int(rank) == int(next_level) == expected
 
 
+def test_a_lane_is_only_passed_from_its_start(world, robots):
+    over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
+    state = put(on("gap", one(robots)), x=11.0).replace(
+        rank=jnp.int32(0), commanded=jnp.float32(9.0)
+    )
+    for start, expected in ((0.9, 1), (6.0, 0)):
+        rank, _ = episode.promoted(
+            world, state.replace(start=jnp.array([start, 0.0])), over, jax.random.key(0)
+        )
+        assert int(rank) == expected
+
+
 def test_no_more_is_asked_for_than_the_lane_is_long(world, robots):
     # 1 m/s for 20 s is 20 m, the way from 0.75 m to the finish at 11 m is 10.25 m
     state = one(robots).replace(command=jnp.array([1.0, 0.0, 0.0]), start=jnp.array([0.75, 0.0]))
+    state = state.replace(is_steered=jnp.array(True))
     assert float(episode._asked(world, state)) == pytest.approx(10.25)
     slow = state.replace(command=jnp.array([0.3, 0.4, 0.0]), step=jnp.int32(500))
     assert float(episode._asked(world, slow)) == pytest.approx(5.0)  # 0.5 m/s for 10 s
@@ -322,6 +406,7 @@ def after(world, robots, walked, commanded, level, rank, cause, review, key=0):
         rank=jnp.int32(rank),
         commanded=jnp.float32(commanded),
         command=jnp.array([0.5, 0.0, 0.0]),
+        is_steered=jnp.array(True),
         step=step,
     )
     state = put(state, x=state.start[0] + walked)

@@ -16,7 +16,10 @@ C = config.Foothold()
 X = 0.12 + 0.04 * np.arange(25)  # m, means of the windows: 24 cm from 0 on, every 4 cm
 ACROSS = 0.007  # m, y of the soles: no point of the buffer lies on the border of two columns
 
-windows = jax.jit(lambda z, c=C: foothold.windows(z, c), static_argnums=1)
+AS_SHIPPED = {"xla_backend_optimization_level": 3}  # its rounding is what is measured here
+windows = jax.jit(
+    lambda z, c=C: foothold.windows(z, c), static_argnums=1, compiler_options=AS_SHIPPED
+)
 
 
 @jax.jit
@@ -195,13 +198,64 @@ def test_heights_are_taken_from_the_sole():
     check(ahead(lane(lambda x: 0.0), sole=soles(z=0.4)), range(25), -0.4)
 
 
-def test_windows_with_a_point_nearer_than_half_a_second_of_the_command_go():
+def test_with_the_gate_on_windows_those_with_a_point_that_is_too_near_go():
     # 0.4 m/s * 0.5 s = 0.2 m. The first point of window k is at 0.01 + 0.04 k: 0.17 for k = 4 and
     # 0.21 for k = 5. 0.8 m/s: 0.4 m, 0.37 for k = 9 and 0.41 for k = 10
-    ground = lane(lambda x: 0.0)
-    check(ahead(ground, command=0.4), range(5, 25), 0.0)
-    check(ahead(ground, command=0.8), range(10, 25), 0.0)
-    check(ahead(ground, command=-1.0), range(25), 0.0)
+    c = dataclasses.replace(C, gate="windows")
+    ground, zero = lane(lambda x: 0.0), jnp.zeros(2)
+    found = lambda command: foothold.candidates(ground, soles(), zero, jnp.float32(command), c)
+    check(found(0.4), range(5, 25), 0.0)
+    check(found(0.8), range(10, 25), 0.0)
+    check(found(-1.0), range(25), 0.0)
+
+
+def test_points_nearer_than_half_a_second_of_the_command_go_and_windows_are_of_the_rest():
+    # 0.4 m/s: 0.2 m. Row i is at 0.01 + 0.02 i, so rows 10 on remain. Window k has rows 2k to
+    # 2k + 11: of window 0 two remain, which are enough, and their mean is at 0.22; from 5 on all
+    found = ahead(lane(lambda x: 0.0), command=0.4)
+    assert found.accepted.all()
+    np.testing.assert_allclose(found.x[0, :6], [0.22, 0.24, 0.26, 0.28, 0.30, 0.32], atol=1e-6)
+    np.testing.assert_allclose(found.x[0, 5:], X[5:], atol=1e-6)
+    # 0.8 m/s: rows 20 on remain, of window 5 two, and of those before it none
+    found = ahead(lane(lambda x: 0.0), command=0.8)
+    assert np.flatnonzero(found.accepted[0]).tolist() == list(range(5, 25))
+    np.testing.assert_allclose(found.x[0, 5:7], [0.42, 0.44], atol=1e-6)
+
+
+def test_what_was_removed_does_not_make_a_window_rough():
+    # a tread of 30 cm from 0.1 m on, 15 cm up, seen at 0.5 m/s: 0.25 m. Rows 12 on remain, of
+    # the tread 12 to 19: windows 1 (12 and 13) to 4 (12 to 19) are on it alone
+    ground = lane(lambda x: 0.15 * max(0.0, math.floor((x + 0.2) / 0.3)))
+    found = ahead(ground, command=0.5)
+    assert np.flatnonzero(found.accepted[0])[:4].tolist() == [1, 2, 3, 4]
+    np.testing.assert_allclose(found.z[0, 1:5], 0.15, atol=1e-6)
+    np.testing.assert_allclose(found.x[0, 1:5], [0.26, 0.28, 0.30, 0.32], atol=1e-6)
+
+
+def test_the_next_tread_is_a_candidate_at_walking_speed():
+    # treads of 30 cm, 20 cm high, the foot on the middle of one at 0.6 m/s. The next tread begins
+    # at 0.15 m and ends at 0.45; 0.30 m is removed, so its last 15 cm, about 0.37, are left. A
+    # gate on windows leaves none before the tread after it, whose middle is at 0.60
+    ground = lane(lambda x: 0.2 * max(0.0, math.floor((x + 0.15) / 0.3)))
+    middle = soles(x=0.30, z=0.2)
+    nearest = lambda found: float(foothold.distance(found, middle)[0])
+    assert nearest(ahead(ground, command=0.6)) < 0.05
+    c = dataclasses.replace(C, gate="windows")
+    whole = foothold.candidates(ground, soles(), jnp.zeros(2), jnp.float32(0.6), c)
+    assert nearest(whole) > 0.25
+
+
+def test_a_window_of_remaining_points_has_the_eigenvalues_of_eigh():
+    z = np.random.default_rng(3).normal(0.0, 0.02, (60, 5)).astype(np.float32)
+    x, y = foothold._lattice(C)
+    remain = x[foothold._rows(C)] >= 0.45  # m; row 22 is the first
+    found = foothold._windows([jnp.asarray(z[:, j]) for j in range(5)], remain, C)
+    for k in range(6, 25):  # of window 6 two rows are left
+        rows = foothold._rows(C)[k][remain[k]]
+        points = np.stack([*np.meshgrid(x[rows], y, indexing="ij"), z[rows]], -1).reshape(-1, 3)
+        size, v = np.linalg.eigh(np.cov(points.astype(np.float64).T))
+        np.testing.assert_allclose(found.roughness[k], math.sqrt(size[0]), rtol=1e-3)
+        np.testing.assert_allclose(found.verticality[k], abs(v[2, 0]), atol=1e-3)
 
 
 def test_a_foot_that_points_left_looks_left():
@@ -255,7 +309,7 @@ def test_turning_and_shifting_robot_and_ground_changes_nothing():
     np.testing.assert_allclose(there, here, atol=1e-4)
 
 
-def test_candidates_stay_during_the_swing_and_are_new_at_the_next_liftoff():
+def test_candidates_stay_during_the_swing_and_are_new_on_the_ground():
     stairs = lane(lambda x: 0.15 * max(0.0, math.floor(x / 0.3)))
     before = ahead(stairs)
     now = ahead(stairs, command=0.6, sole=soles(x=0.31, z=0.2), heading=0.4)

@@ -175,6 +175,19 @@ def test_a_flight_rises_evenly_and_stays_above(seed):
     np.testing.assert_array_equal(single("descent", 0.23, seed=seed).max(), 0.0)
 
 
+def test_each_level_has_as_many_variants_as_are_asked_for():
+    c = config.Terrain(name="gap", variants=3, seed=5)
+    atlas = lanes.build(c)
+    assert (atlas.levels, atlas.variants, atlas.sizes.shape) == (10, 3, (10, 1))
+    x = jnp.stack([(jnp.arange(600) + 0.5) * CELL, jnp.zeros(600)], axis=1)
+    for level, variant in ((0, 2), (4, 0), (9, 1)):
+        alone = lanes.build(config.Terrain(name="gap", seed=5 + variant))
+        found = terrain.height_at(atlas.tile(level, 0, variant), x)
+        np.testing.assert_array_equal(found, terrain.height_at(alone.tile(level, 0), x))
+    of_one_level = [terrain.height_at(atlas.tile(9, 0, k), x) for k in range(3)]
+    assert (of_one_level[0] != of_one_level[1]).any() and (of_one_level[1] != of_one_level[2]).any()
+
+
 def test_a_grid_has_each_size_with_each_seed():
     c = config.Terrain()
     atlas = lanes.grid(c, {"gap": (0.3, 0.5), "platform": (0.2, 0.4)}, [7, 8, 9])

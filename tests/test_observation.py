@@ -103,15 +103,26 @@ def test_the_height_scan_is_clipped(ground):
     np.testing.assert_array_equal(observation.height_scan(ground, state()[0], c), [1.0])
 
 
-def test_the_critic_sees_the_clean_observation_then_the_velocity_then_the_heights():
-    found = observation.privileged(jnp.arange(45.0), jnp.arange(3) + 50.0, jnp.arange(6) + 60.0)
-    np.testing.assert_array_equal(found, [*range(45), 50, 51, 52, *range(60, 66)])
+def test_the_critic_sees_the_clean_observation_the_velocity_the_hidden_and_last_the_heights():
+    parts = (jnp.arange(45.0), jnp.arange(3) + 50.0, jnp.arange(2) + 55.0, jnp.arange(6) + 60.0)
+    found = observation.privileged(*parts)
+    np.testing.assert_array_equal(found, [*range(45), 50, 51, 52, 55, 56, *range(60, 66)])
+
+
+def test_the_fine_row_places_a_riser_within_its_spacing():
+    # a step up of 20 cm at x = 1.0; the base at x = 0.3, 0.62 m up: 0.7 m ahead, of samples from
+    # -0.2 m on every 5 cm; the one at 0.7 m is up already
+    heights = np.where((np.arange(200) + 0.5) * 0.02 > 0.99, 0.2, 0.0)[:, None]
+    ground = terrain.from_heights(heights, 0.02, (0.0, 0.0))
+    qpos = jnp.zeros(19).at[:4].set(jnp.array([0.3, 0.0, 0.62, 1.0]))
+    found = observation.fine_row(ground, qpos, config.Scan())
+    np.testing.assert_allclose(found, [*[0.0] * 18, *[-0.2] * 7], atol=1e-6)
 
 
 def test_noise_stays_within_its_bounds_and_reaches_them():
     c = config.Randomisation()
     clean = observation.motion(*state(velocity=(1.0, 2.0, 3.0)), JOINTS)
-    noisy = jax.vmap(lambda key: observation.with_noise(clean, c, key))(
+    noisy = jax.vmap(lambda key: observation.with_noise(clean, c, 1.0, key))(
         jax.random.split(jax.random.key(0), 2000)
     )
     bounds = {

@@ -34,7 +34,11 @@ TABLE_1 = {
     "ankle_position": -10.0,
     "stumble": -10.0,
 }
-ALTERNATIVES = {"foot_contact_quality": 0.0}  # rows that take another's place, off by default
+ALTERNATIVES = {  # rows that Table I has not, off by default
+    "foot_contact_quality": 0.0,
+    "air_time_variance": 0.0,
+    "foot_up_when_standing": 0.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +68,18 @@ def perfect(x2: robot.Robot) -> reward.Snapshot:
         foot_force=jnp.array([[0.0, 0.0, 200.0], [0.0, 0.0, 200.0]]),
         first_contact=jnp.zeros(2, bool),
         air_time=jnp.full(2, PERIOD),
+        last_air_time=jnp.zeros(2),
         foothold_distance=jnp.full(2, jnp.inf),
         unsupported=jnp.zeros(2, jnp.int32),
         since_single=jnp.float32(9.0),
         control_period=jnp.float32(PERIOD),
     )
+
+
+def walking(x2: robot.Robot) -> reward.Snapshot:
+    """Walk at 0.6 m/s as Table I wants it."""
+    ahead = jnp.array([0.6, 0.0, 0.0])
+    return perfect(x2)._replace(velocity=ahead, command=ahead, since_single=jnp.float32(0.0))
 
 
 def joints(x2: robot.Robot, start, **changes) -> list[float]:
@@ -223,6 +234,22 @@ def test_feet_air_time(x2):
     check(x2, "feet_air_time", 0.0, air_time=[0.3, 0.9])
 
 
+def test_air_time_variance(x2):
+    # the last swings took 0.46 and 0.20 s: (0.13)^2
+    limp = {"first_contact": [False, True], "last_air_time": [0.46, 0.20]}
+    check(x2, "air_time_variance", 0.0169, **limp)
+    check(x2, "air_time_variance", 0.0, last_air_time=[0.46, 0.20])  # no foot comes down
+    check(x2, "air_time_variance", 0.0, first_contact=[True, False], last_air_time=[0.3, 0.0])
+    check(x2, "air_time_variance", 0.0, first_contact=[True, False], last_air_time=[0.3, 0.3])
+
+
+def test_foot_up_when_standing(x2):
+    up = [[0.0, 0.0, 200.0], [0.0, 0.0, 5.0]]  # N
+    check(x2, "foot_up_when_standing", 1.0, foot_force=up)
+    check(x2, "foot_up_when_standing", 2.0, foot_force=np.zeros((2, 3)))
+    check(x2, "foot_up_when_standing", 0.0, foot_force=up, command=[0.2, 0.0, 0.0])
+
+
 def test_foot_slip(x2):
     # |(0, 3, 4)| = 5 is not above 5; |(0, 0, 6)| is: |(0.1, 0.2, 0.2)| = 0.3
     check(
@@ -308,7 +335,7 @@ def test_the_sum_is_scaled_by_the_period_and_cut_at_zero(x2, times_dt, clip_at_z
 
 def test_a_touchdown_counts_for_its_own_time(x2):
     # on a foothold after 0.3 s in the air: 7.4 * 0.02 + (2 - 2.5 * (0.5 - 0.3)) * 0.25 = 0.523
-    landing = perfect(x2)._replace(
+    landing = walking(x2)._replace(
         first_contact=jnp.array([True, False]),
         air_time=jnp.array([0.3, PERIOD]),
         foothold_distance=jnp.array([0.0, jnp.inf]),
@@ -318,6 +345,44 @@ def test_a_touchdown_counts_for_its_own_time(x2):
     assert float(parts["foothold_placement"]) == pytest.approx(2.0 * 0.25 / 0.02)
     raw, _ = reward.total(landing, dataclasses.replace(C, times_dt=False), x2)
     assert float(raw) == pytest.approx(7.4 + 2.0 - 0.5)
+
+
+def landed(x2, air_time: float, velocity_z: float = 0.0) -> float:
+    """Return the reward of a step in which the left foot has come down far from any foothold."""
+    landing = walking(x2)._replace(
+        first_contact=jnp.array([True, False]),
+        air_time=jnp.array([air_time, 0.0]),
+        velocity=jnp.array([0.6, 0.0, velocity_z]),
+    )
+    return float(reward.total(landing, C, x2)[0])
+
+
+def test_the_cut_leaves_touchdowns_alone(x2):
+    # 0.1 s in the air: 7.4 * 0.02 - 2.5 * 0.4 * 0.25 = -0.102; with 3 m/s up the rest is cut at 0
+    assert landed(x2, 0.1) == pytest.approx(-0.102)
+    assert landed(x2, 0.1, velocity_z=3.0) == pytest.approx(-0.25)
+
+
+def test_two_equal_steps_never_earn_less_than_one_long_and_one_short(x2):
+    for velocity_z in (0.0, 2.5, 3.0):
+        for difference in (0.05, 0.13, 0.25):
+            equal = 2.0 * landed(x2, 0.33, velocity_z)
+            limp = landed(x2, 0.33 + difference, velocity_z) + landed(
+                x2, 0.33 - difference, velocity_z
+            )
+            assert equal >= limp - 1e-6
+
+
+def test_a_touchdown_counts_for_nothing_while_standing_is_commanded(x2):
+    still = perfect(x2)
+    stepping = still._replace(
+        first_contact=jnp.array([True, True]),
+        air_time=jnp.array([0.3, 0.7]),
+        foothold_distance=jnp.zeros(2),
+    )
+    (of_step, parts), (of_still, _) = (reward.total(s, C, x2) for s in (stepping, still))
+    assert float(of_step) == float(of_still)
+    assert all(float(parts[name]) == 0.0 for name in reward.EVENTS)
 
 
 def test_a_positive_sum_passes_the_cut(x2):

@@ -62,6 +62,14 @@ def test_an_experiment_changes_what_its_name_says(experiment, table, setting, va
     assert getattr(getattr(c, table), setting) == value
 
 
+def test_the_paper_is_the_same_on_every_device():
+    cpu, gpu = (runs.composed("mixed", "paper", device) for device in ("cpu", "gpu"))
+    assert cpu == gpu
+    assert cpu.reward.event_time == cpu.physics.control_period  # a touchdown is one step's reward
+    additions = cpu.reward.weights.air_time_variance, cpu.reward.weights.foot_up_when_standing
+    assert additions == (0.0, 0.0) and cpu.ppo.readout_weight == 0.0 and cpu.ppo.average == 0
+
+
 def test_the_reward_experiments_differ_in_the_foothold_terms_alone():
     weights = lambda name: runs.composed("stairs", name, "gpu").reward.weights
     none, quality = weights("no_foothold_reward"), weights("foot_contact_quality")

@@ -1,0 +1,40 @@
+"""Randomisation that grows with competence: one share of all its ranges, for all robots.
+
+A policy that falls at once under all of it learns nothing from it, and one that hardly falls has
+nothing left to learn from less.
+"""
+
+from typing import no_type_check
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cref_jax import config
+
+_MEMORY = 0.9  # of the falls of before, in each iteration; assumed
+
+
+@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@flax.struct.dataclass
+class Ramp:
+    """How much is randomised, and what that is decided by."""
+
+    share: Float[Array, ""]  # of the ranges in the configuration, 0 to 1
+    falls: Float[Array, ""]  # per minute and robot, over the last iterations
+
+
+def begun(c: config.Randomisation) -> Ramp:
+    """Begin with nothing randomised, or with everything where there is no ramp."""
+    low, high = c.ramp_falls
+    return Ramp(jnp.float32(0.0 if c.ramp else 1.0), jnp.float32(0.5 * (low + high)))
+
+
+def advanced(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:
+    """Raise the share after few falls per minute, lower it after many, and keep it in between."""
+    if not c.ramp:
+        return ramp
+    mean = _MEMORY * ramp.falls + (1.0 - _MEMORY) * falls
+    low, high = c.ramp_falls
+    up, down = (mean < low).astype(jnp.float32), (mean > high).astype(jnp.float32)
+    return Ramp(jnp.clip(ramp.share + c.ramp_step * (up - down), 0.0, 1.0), mean)

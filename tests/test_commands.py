@@ -1,0 +1,67 @@
+"""What is said of robots that were told to stand, walk and stop: traces made by hand."""
+
+import numpy as np
+import pytest
+
+from cref_jax import commands
+from cref_jax.commands import Trace
+
+PERIOD = 0.02  # s
+STEPS = 500  # 10 s
+
+
+def trace(speed, steps=(), fell_at=None, air=(0.0, 0.0)) -> Trace:
+    """Return one robot that walks ahead at `speed` [T] m/s and steps at these control steps."""
+    ahead = np.broadcast_to(np.asarray(speed, float), STEPS)
+    position = np.stack([np.cumsum(ahead) * PERIOD, np.zeros(STEPS)], axis=-1)
+    touchdown, airborne = np.zeros((STEPS, 1, 2), bool), np.zeros((STEPS, 1, 2), bool)
+    touchdown[list(steps), 0, 0] = True
+    for foot, share in enumerate(air):
+        airborne[100 : 100 + round(share * 400), 0, foot] = True
+    fallen = np.zeros((STEPS, 1), bool)
+    if fell_at is not None:
+        fallen[fell_at:] = True
+    velocity = np.stack([ahead, np.zeros(STEPS), np.zeros(STEPS)], axis=-1)
+    return Trace(position[:, None], velocity[:, None], touchdown, airborne, fallen)
+
+
+def together(*traces) -> Trace:
+    return Trace(*(np.concatenate(parts, axis=1) for parts in zip(*traces, strict=True)))
+
+
+def test_who_stands_stays_within_5_cm_and_takes_no_step_after_2_s():
+    seen = together(
+        trace(0.004, steps=[20, 99]),  # 4 cm in 10 s; its steps are in the first 2 s
+        trace(0.004, steps=[100]),
+        trace(0.006),  # 6 cm
+        trace(0.0, fell_at=480),
+    )
+    found = commands.row(seen, commands.STAND, PERIOD)
+    assert (found["trials"], found["fell"], found["stood"], found["still"]) == (4, 1, 2, 2)
+    assert found["drift_m"] == pytest.approx(0.04, abs=1e-3)
+
+
+def test_the_error_is_that_of_the_mean_velocity_after_2_s():
+    speed = np.where(np.arange(STEPS) < 100, 0.0, 0.5)
+    seen = together(trace(speed, air=(0.4, 0.3)), trace(speed + 0.2), trace(9.0, fell_at=300))
+    found = commands.row(seen, (0.6, 0.0, 0.0), PERIOD)
+    np.testing.assert_allclose(found["velocity"], [0.6, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found["error"], [0.1, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found["airborne"], [0.2, 0.15], atol=1e-9)
+    assert "stood" not in found
+
+
+def test_a_robot_stops_where_it_is_at_the_end():
+    # 0.6 m/s until 0.5 s after it is told to stop at 5 s: 30 cm
+    speed = np.where(np.arange(STEPS) <= 275, 0.6, 0.0)
+    found = commands.stopped(trace(speed), PERIOD)
+    assert found["distance_m"] == pytest.approx(0.3, abs=1e-9) and found["fell"] == 0
+
+
+def test_when_all_have_fallen_there_are_no_numbers():
+    seen = trace(0.3, fell_at=10)
+    found = {"commands": [commands.row(seen, commands.STAND, PERIOD)]}
+    found["stop"] = commands.stopped(seen, PERIOD)
+    assert found["commands"][0]["velocity"] is None and found["stop"]["distance_m"] is None
+    assert commands.text(found).row_count == 1
+    assert "0 of 1 within 5 cm" in commands.lines(found)
