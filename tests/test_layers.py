@@ -43,7 +43,7 @@ LAYERS = [
     {"world", "observation", "reward"},
     {"episode"},
     {"env", "network", "ppo"},
-    {"rollout", "checkpoint", "distill", "brax_env", "gaze"},
+    {"rollout", "checkpoint", "distill", "brax_env", "gaze", "mirror"},
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"commands", "runs", "stages", "stand_in", "table", "run_page", "ood"},

@@ -1,0 +1,95 @@
+"""The mirror against the simulation: a mirrored state does what the state does, mirrored."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from sample import ROBOTS, C, on, one
+
+from cref_jax import env, mirror, network
+
+MODEL_NAMES = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+SIGNS = (1, -1, -1, 1, 1, -1)
+
+
+@pytest.fixture
+def joints(world):
+    return mirror.joints(world.physics.model)
+
+
+def test_legs_change_places_and_rolls_and_yaws_their_sign(world, joints):
+    names = world.physics.robot.joint_names
+    for j, name in enumerate(names):
+        side, part = name.removesuffix("_joint").split("_", 1)
+        other = {"left": "right", "right": "left"}[side]
+        assert names[joints.partner[j]] == name.replace(side, other)
+        assert joints.sign[j] == SIGNS[MODEL_NAMES.index(part)]
+
+
+def test_a_mirror_image_of_a_mirror_image_is_the_thing_itself(world, robots, joints):
+    for values in (robots.body.qpos[:, 7:], robots.body.qvel[:, 6:]):
+        np.testing.assert_array_equal(joints.flipped(joints.flipped(values)), values)
+    twice = jax.vmap(lambda b: mirror.body(mirror.body(b, joints), joints))(robots.body)
+    jax.tree.map(np.testing.assert_array_equal, twice, robots.body)
+    seen = jax.random.normal(jax.random.key(0), (5, 45))
+    again = mirror.proprioception(mirror.proprioception(seen, joints), joints)
+    np.testing.assert_array_equal(again, seen)
+
+
+def test_an_image_is_turned_over(world):
+    image = jax.random.uniform(jax.random.key(1), (2, 48, 64)).astype(jnp.float16)
+    c = C.network
+    found = network.as_image(c, mirror.frame(network.in_patches(c, image), c))
+    np.testing.assert_array_equal(found, image[..., ::-1])
+
+
+def test_a_model_with_one_leg_more_is_refused(world):
+    lame = mujoco.MjModel.from_xml_string("""
+      <mujoco><worldbody><body><freejoint/><geom size=".1"/>
+        <body><joint name="left_knee_joint" axis="0 1 0"/><geom size=".1"/></body>
+      </body></worldbody></mujoco>""")
+    with pytest.raises(ValueError, match="no right_knee_joint"):
+        mirror.joints(lame)
+
+
+def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
+    # on lanes that are level across, without randomisation; a few control steps, since contact
+    # magnifies rounding
+    state = jax.tree.map(lambda x: jnp.stack([x] * ROBOTS), on("stairs_up", one(robots), level=2))
+    rng = np.random.default_rng(0)
+    body = state.body._replace(
+        qpos=state.body.qpos.at[:, 7:].add(0.05 * rng.normal(size=state.body.qpos[:, 7:].shape)),
+        qvel=state.body.qvel + 0.2 * rng.normal(size=state.body.qvel.shape).astype(np.float32),
+    )
+    state = state.replace(
+        body=body,
+        dynamics=jax.tree.map(lambda x: jnp.stack([x] * ROBOTS), world.physics.nominal_dynamics()),
+        joint_offset=jnp.zeros_like(state.joint_offset),
+        delay=jnp.zeros_like(state.delay),
+        push_left=jnp.full(ROBOTS, 99),
+        command_left=jnp.full(ROBOTS, 99),
+        spread=jnp.zeros(ROBOTS),  # no sensor noise
+    )
+    image = state.replace(
+        body=jax.vmap(lambda b: mirror.body(b, joints))(state.body),
+        command=mirror.COMMAND * state.command,
+    )
+    step = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
+    look = jax.jit(jax.vmap(env.depth_image, in_axes=(None, 0)))
+    for _ in range(3):
+        action = jnp.asarray(0.5 * rng.normal(size=state.action.shape), jnp.float32)
+        state, real = step(world, state, action)
+        image, imagined = step(world, image, joints.flipped(action))
+        there, here = real.observation, imagined.observation
+        np.testing.assert_allclose(
+            here.proprioception, mirror.proprioception(there.proprioception, joints), atol=2e-3
+        )
+        np.testing.assert_allclose(here.velocity, mirror.POLAR * there.velocity, atol=1e-3)
+        np.testing.assert_allclose(imagined.reward, real.reward, atol=1e-3)
+        heights = lambda seen: seen.privileged[:, -C.scan.x[2] * C.scan.y[2] :]
+        np.testing.assert_allclose(heights(here), mirror.scan(heights(there), C.scan), atol=1e-3)
+        feet = imagined.measures.airborne[:, ::-1]
+        np.testing.assert_array_equal(feet, real.measures.airborne)
+    difference = np.abs(np.asarray(look(world, image))[..., ::-1] - np.asarray(look(world, state)))
+    assert np.mean(difference < 0.01) > 0.99  # of the pixels; rounding decides at edges
