@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float16
 
-from cref_jax import config, network, observation, ppo, rollout
+from cref_jax import config, depth, network, observation, ppo, rollout
 from cref_jax.robot import Robot
 from cref_jax.world import World
 
@@ -57,7 +57,8 @@ def test_vectors(world: World, train: ppo.TrainState) -> dict[str, np.ndarray]:
         metres = (image[at].astype(np.float32) + 0.5) * np.float32(c.camera.d_max)
         metres[HOLED][HOLES] = 0.0
         metres[HOLED][HOLES[0].stop :, HOLES[1]] = np.nan
-        steps = steps._replace(image=image)
+        near = jax.vmap(functools.partial(depth.nearest_around, window=c.camera.window))
+        steps = steps._replace(image=np.asarray(near(jnp.asarray(image))))  # of these frames
         vectors |= {"frames": metres, "frame_step": at, "stamps": now[at] - period}
     else:
         none = np.zeros(0)

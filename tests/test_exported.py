@@ -124,6 +124,12 @@ def test_the_bundled_policy_is_whole_and_small_enough():
     assert sum(file.stat().st_size for file in files) < 10e6
 
 
-def test_the_bundled_runtime_is_this_versions():
-    theirs = exported.bundled() / "cref_runtime.py"
+@pytest.mark.parametrize("name", ["mixed", "robust"])
+def test_the_bundled_runtime_is_this_versions(name):
+    theirs = exported.bundled().with_name(name) / "cref_runtime.py"
     assert theirs.read_bytes() == Path(deploy.__file__).read_bytes()  # export --refresh mends it
+
+
+@pytest.mark.parametrize("name", ["mixed", "robust"])  # one with a ray per pixel, one with windows
+def test_a_bundled_policy_says_what_it_said_in_training(name):
+    deploy.self_test(exported.bundled().with_name(name))

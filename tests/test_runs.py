@@ -55,6 +55,7 @@ def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
         ("blind", "network", "variant", "blind"),
         ("full", "network", "variant", "full"),
         ("paper", "randomisation", "enabled", False),
+        ("robust", "randomisation", "ramp", True),
     ],
 )
 def test_an_experiment_changes_what_its_name_says(experiment, table, setting, value):
