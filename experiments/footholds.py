@@ -54,12 +54,13 @@ def draw(axis: Axes, kind: str, size: float, command: float) -> None:
     z = terrain.height_at(ground, jnp.stack([start + x, jnp.zeros(x.size)], axis=-1))
     ok = np.asarray(found.accepted[0])
     mean = np.stack([found.x[0], found.z[0]])
+    refused = ~ok & (mean[0] >= gate)  # of the others no point is left
     axis.plot(lane_x - start, height, color="0.6", lw=1, zorder=1)
     axis.plot([-0.095, 0.095], [0.0, 0.0], color="k", lw=5, solid_capstyle="butt", label="sole")
     axis.scatter(x[x >= gate], z[x >= gate], s=5, color="tab:blue", label="points", zorder=2)
     axis.scatter(x[x < gate], z[x < gate], s=5, color="0.8", label="points nearer than the gate")
     axis.scatter(
-        *mean[:, ~ok], marker="x", color="red", s=20, lw=0.7, label="refused, or too near", zorder=3
+        *mean[:, refused], marker="x", color="red", s=20, lw=0.7, label="refused", zorder=3
     )
     axis.scatter(*mean[:, ok], color="green", s=40, label="accepted", zorder=4)
     axis.axvline(gate, color="0.7", lw=0.8, ls="--")
