@@ -43,14 +43,14 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         os._exit(130)  # at once: a running program may call into this interpreter until its end
 
 
-def writable(out: Path, suffix: str) -> Path:
+def writable(out: Path, suffix: str, option: str = "--out") -> Path:
     """Return the file to write, its folder made.
 
     Raises:
         ConfigError: its name does not end in `suffix`, or it cannot be written.
     """
     if out.suffix != suffix:
-        raise ConfigError(f"--out must end in {suffix}: {out}")
+        raise ConfigError(f"{option} must end in {suffix}: {out}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -9,7 +9,7 @@ from cref_jax import deploy  # before numpy, whose number of threads it sets
 
 import tyro
 
-from cref_jax import cli, exported, runs
+from cref_jax import cli, exported, learner, runs
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,9 @@ class Options:
     """runs/NAME; the newest one when left out"""
     out: Path = Path("policy")
     """the directory; the same as one file is written to the directory's name with .zip"""
+    learner: Path | None = None
+    """write all that was learned, the critic and the optimiser too, to this .npz instead: to go on
+    with elsewhere, by --init"""
     refresh: bool = False
     """only give the policy that is there the runtime of this version"""
     debug: bool = False
@@ -31,6 +34,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.export")
     with cli.one_line_errors(options.debug):
         cli.prepare()
+        if options.learner:
+            _write_learner(
+                options.run or runs.newest(), cli.writable(options.learner, ".npz", "--learner")
+            )
+            return
         if options.refresh:
             exported.refresh(options.out)
         else:
@@ -48,6 +56,13 @@ def _export(options: Options) -> None:
     world = runs.world_of(runs.read_config(run), "mujoco")
     print(f"exporting {run} ...", flush=True)
     exported.write(runs.load_policy(run, world), world, options.out)
+
+
+def _write_learner(run: Path, out: Path) -> None:
+    """Write what the run has learned."""
+    world = runs.world_of(runs.read_config(run), "mujoco")
+    learner.write(runs.load_policy(run, world), out)
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; python -m cref_jax.train --init {out}")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, deploy, learn, leaves, ppo, robot, runs, vectors
+from cref_jax import config, deploy, learn, learner, leaves, ppo, robot, runs, vectors
 from cref_jax.config import Config, ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
@@ -95,25 +95,29 @@ def bundled() -> Path:
 
 def is_run(path: Path) -> bool:
     """Return whether this is a run and not an exported policy."""
-    return path.suffix != ".zip" and not (path / "manifest.json").is_file()
+    return path.suffix not in (".zip", ".npz") and not (path / "manifest.json").is_file()
 
 
 def read_config(path: Path) -> Config:
-    """Return the settings that a run or an exported policy was trained with.
+    """Return the settings that a run, what it has learned, or an exported policy was trained with.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is none of these.
     """
+    if learner.is_learner(path):
+        return learner.read_config(path)
     return runs.read_config(path) if is_run(path) else _config(_contents(path)[0])
 
 
 def load(path: Path, world: World) -> Policy:
-    """Return the policy of a run, or an exported one, to evaluate in JAX.
+    """Return the policy of a run, of what it has learned, or an exported one, to evaluate in JAX.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is none of these.
         CheckpointError: the run has no checkpoint that can be read.
     """
+    if learner.is_learner(path):
+        return learner.read(path, world)
     return runs.load_policy(path, world) if is_run(path) else read(path, world)
 
 

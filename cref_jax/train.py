@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, evaluation, exported, learn, limits, processes, runs
+from cref_jax import cli, evaluation, exported, learn, learner, limits, processes, runs
 from cref_jax.checkpoint import Checkpoints, lock
 from cref_jax.config import Config, ConfigError
 from cref_jax.physics import EngineName, resolve_engine
@@ -53,8 +53,8 @@ class Options:
     run_dir: Path | None = None
     """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
     init: Path | None = None
-    """a run, or an exported policy, as which this run begins; without a critic, or with another,
-    the critic learns alone first"""
+    """a run, what it has learned (export --learner), or an exported policy, as which this run
+    begins; without a critic, or with another, the critic learns alone first"""
     resume: bool = False
     """go on with the run in --run-dir, or with the newest one"""
     print_config: bool = False
@@ -339,7 +339,8 @@ def _has_critic(init: Path, c: Config) -> bool:
     """Return whether everything that a training learns is in `init`, and not the actor alone."""
     theirs = exported.read_config(init)
     read_out = theirs.ppo.readout_weight > 0.0, c.ppo.readout_weight > 0.0
-    return exported.is_run(init) and theirs.network == c.network and read_out[0] == read_out[1]
+    whole = exported.is_run(init) or learner.is_learner(init)
+    return whole and theirs.network == c.network and read_out[0] == read_out[1]
 
 
 def _name(options: Options) -> str:

@@ -47,6 +47,7 @@ LAYERS = [
     {"trials"},
     {"learn", "evaluation", "cli", "progress", "scene", "panel", "vectors"},
     {"commands", "runs", "stages", "stand_in", "table", "run_page", "ood"},
+    {"learner"},
     {"exported", "ood_verdict", "transfer", "peers", "brax_peer"},
     {"watch", "ood_suite", "roofline"},
     {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},

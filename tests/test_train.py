@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from cref_jax import config, exported, learn, runs, train
+from cref_jax import config, export, exported, learn, runs, train
 from cref_jax.checkpoint import Checkpoints
 
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
@@ -137,8 +137,12 @@ def test_a_run_begins_as_a_policy_whose_critic_is_gone(first: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_run_begins_as_another_run_with_all_that_it_learned(first: Path, tmp_path: Path):
-    run(tmp_path / "second", "--init", str(first), "--iterations", "1")
+@pytest.mark.parametrize("as_file", [False, True])
+def test_a_run_begins_as_another_run_with_all_that_it_learned(first, tmp_path, as_file):
+    source = tmp_path / "learned.npz" if as_file else first
+    if as_file:
+        export.main(["--run", str(first), "--learner", str(source)])
+    run(tmp_path / "second", "--init", str(source), "--iterations", "1")
     assert runs.read_config(tmp_path / "second").ppo.critic_first == 0
     log = [json.loads(line) for line in (tmp_path / "second" / "log.jsonl").open()]
     assert log[0]["iteration"] == 1

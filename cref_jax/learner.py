@@ -1,0 +1,76 @@
+"""All that a training has learned as one file, without its robots: to go on with elsewhere.
+
+A checkpoint of thousands of robots is hundreds of megabytes, and what they have learned is ten.
+"""
+
+import dataclasses
+import json
+import zipfile
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from cref_jax import config, learn, leaves
+from cref_jax.config import Config, ConfigError
+from cref_jax.runs import Policy
+from cref_jax.world import World
+
+_SETTINGS, _ITERATION = "settings", "iterations"  # names that no leaf has
+
+
+def is_learner(path: Path) -> bool:
+    """Return whether the name is that of such a file."""
+    return path.suffix == ".npz"
+
+
+def write(policy: Policy, out: Path) -> None:
+    """Write actor, critic, optimiser and statistics, and the settings of the run.
+
+    Raises:
+        ConfigError: the disk refused.
+    """
+    arrays = leaves.on_host(policy.train)
+    arrays[_SETTINGS] = np.array(json.dumps(dataclasses.asdict(policy.config)))
+    arrays[_ITERATION] = np.array(policy.iteration)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}") from None
+
+
+def read_config(path: Path) -> Config:
+    """Return the settings of the run that learned this.
+
+    Raises:
+        ConfigError: it is no such file, or of another version of the program.
+    """
+    return config.override(Config(), json.loads(str(_arrays(path)[_SETTINGS])))
+
+
+def read(path: Path, world: World) -> Policy:
+    """Return what was learned; `world` may have another terrain.
+
+    Raises:
+        ConfigError: it is no such file, or the network is another one.
+    """
+    arrays, c = _arrays(path), read_config(path)
+    like = jax.eval_shape(lambda w: learn.initial_state(w).train, world)
+    for name, leaf in leaves.by_path(like).items():
+        if name not in arrays or arrays[name].shape != leaf.shape:
+            raise ConfigError(f"{path} does not fit these settings: {name} is not {leaf.shape}")
+    placed = {name: jax.numpy.asarray(x) for name, x in arrays.items() if name != _SETTINGS}
+    return Policy(c, leaves.filled(like, placed), int(arrays[_ITERATION]), path)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from None
+    if missing := {_SETTINGS, _ITERATION} - arrays.keys():
+        raise ConfigError(f"{path} is not what export --learner writes: no {sorted(missing)[0]}")
+    return arrays

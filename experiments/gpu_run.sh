@@ -1,0 +1,76 @@
+#!/usr/bin/env bash
+# Train on a GPU machine that is at hand for minutes and has no network, but Python and JAX for CUDA.
+#
+#   experiments/gpu_run.sh pack FOLDER [--python 3.12]
+#       here: this project as a wheel, and what such a machine has not, for x86-64
+#   FOLDER/gpu_run.sh run OUT [--minutes 9] [--mib 16] [--from LEARNED.npz] -- TRAINING OPTIONS
+#       there: install that apart, train until a minute before the end, and write to OUT the log and
+#       learned.npz, from which the next call goes on; no file there is above 16 MiB
+#
+# For example: gpu_run.sh run out --minutes 9 -- --terrain mixed --experiment robust --engine warp
+set -euo pipefail
+
+here=$(cd "$(dirname "$0")" && pwd)
+PACKAGES="brax docstring_parser flax glfw imageio-ffmpeg jaxopt jaxtyping mediapy ml_collections mujoco
+  mujoco-core mujoco-mjx optax orbax-checkpoint tensorboardX trimesh typeguard tyro warp-lang"
+
+fail() { echo "error: $*" >&2; exit 2; }
+
+pack() {
+  local folder=${1:?pack needs a folder} python=3.12 root wanted=() version
+  [ "${2:-}" = "--python" ] && python=${3:?--python needs a version}
+  root=$(cd "$here/.." && pwd)
+  local pip="$root/.venv/bin/python -m pip --disable-pip-version-check"
+  [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
+  for name in $PACKAGES; do
+    version=$($pip show "$name" 2>/dev/null | awk '/^Version:/ { print $2 }')
+    wanted+=("$name${version:+==$version}")
+  done
+  mkdir -p "$folder"
+  $pip wheel --quiet --no-deps --wheel-dir "$folder" "$root"
+  $pip download --quiet --no-deps --only-binary=:all: --python-version "$python" \
+    --implementation cp --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
+    --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 --dest "$folder" "${wanted[@]}"
+  cp "$here/gpu_run.sh" "$folder/"
+  du -sh "$folder"
+}
+
+run() {
+  local out=${1:?run needs a folder to write to} minutes=9 mib=16 from="" begun start=() status=0
+  begun=$(date +%s); shift
+  while [ $# -gt 0 ] && [ "$1" != "--" ]; do
+    case $1 in
+      --minutes) minutes=$2 ;; --mib) mib=$2 ;; --from) from=$2 ;;
+      *) fail "unknown option $1; known: --minutes, --mib, --from, and -- before those of train" ;;
+    esac
+    shift 2
+  done
+  shift || true
+  [ "$minutes" -ge 2 ] || fail "--minutes must be at least 2, not $minutes"
+  mkdir -p "$out"
+  local site=$here/site work=$here/run
+  [ -d "$site" ] || python3 -m pip install --quiet --no-index --no-deps --no-compile \
+    --disable-pip-version-check --target "$site" "$here"/*.whl
+  export PYTHONPATH=$site XDG_CACHE_HOME=$here/cache WARP_CACHE_PATH=$here/cache/warp
+  export MUJOCO_GL=${MUJOCO_GL:-disable} PYTHONUNBUFFERED=1
+  python3 -c "import jax; print(jax.__version__, jax.devices())"
+  [ -n "$from" ] && start=(--init "$from")
+  [ -d "$work/checkpoints" ] && start=(--resume)
+  python3 -m cref_jax.train "$@" "${start[@]}" --run-dir "$work" --no-evaluate --no-tensorboard \
+    > "$out/train.log" 2>&1 &
+  local training=$! last=$((begun + 60 * minutes - 60))
+  while kill -0 $training 2>/dev/null && [ "$(date +%s)" -lt $last ]; do sleep 1; done
+  kill -TERM $training 2>/dev/null || true
+  wait $training || status=$?
+  tail -n 3 "$out/train.log"
+  [ "$status" -eq 0 ] || fail "training ended with $status; see $out/train.log"
+  cp "$work/log.jsonl" "$work/config.json" "$work/origin.jsonl" "$out/"
+  JAX_PLATFORMS=cpu python3 -m cref_jax.export --run "$work" --learner "$out/learned.npz"
+  find "$out" -type f -size +"$mib"M -print -exec gzip -9 {} + | sed 's/^/above the limit, packed: /'
+  echo "$(($(date +%s) - begun)) of $((60 * minutes)) s"
+}
+
+case ${1:-} in
+  pack | run) "$@" ;;
+  *) sed -n '2,11s/^# \{0,1\}//p' "$0"; exit 2 ;;
+esac
