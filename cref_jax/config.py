@@ -91,6 +91,9 @@ class Reward:
     # legged_gym has it, air time and footholds weigh too little to lengthen a step
     clip_at_zero: bool = True  # of all terms but touchdowns; assumed: without it the negative sum
     # at first teaches falling
+    clip_touchdowns: bool = (
+        False  # touchdowns within that cut, too: few samples then lift feet sooner
+    )
     debounce: int = 2  # control steps with contact, or without, until a foot counts as down or up;
     # assumed: a scuff of one step is neither. 1: each contact is a touchdown
     sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym

@@ -253,6 +253,8 @@ def total(
     parts |= {name: parts[name] * worth for name in EVENTS}
     events = sum((parts[name] for name in EVENTS), start=jnp.zeros(()))
     dense = sum((x for name, x in parts.items() if name not in EVENTS), start=jnp.zeros(()))
+    if c.clip_touchdowns:
+        dense, events = dense + events, jnp.zeros(())
     if c.clip_at_zero:
         dense = jnp.maximum(dense, 0.0)
     return (dense + events) * (s.control_period if c.times_dt else 1.0), parts

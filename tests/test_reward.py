@@ -363,6 +363,14 @@ def test_the_cut_leaves_touchdowns_alone(x2):
     assert landed(x2, 0.1, velocity_z=3.0) == pytest.approx(-0.25)
 
 
+def test_a_cut_that_takes_touchdowns_in_makes_short_steps_free(x2):
+    landing = walking(x2)._replace(
+        first_contact=jnp.array([True, False]), velocity=jnp.array([0.6, 0.0, 3.0])
+    )
+    c = dataclasses.replace(C, clip_touchdowns=True)
+    assert float(reward.total(landing, c, x2)[0]) == 0.0
+
+
 def test_two_equal_steps_never_earn_less_than_one_long_and_one_short(x2):
     for velocity_z in (0.0, 2.5, 3.0):
         for difference in (0.05, 0.13, 0.25):
