@@ -87,7 +87,7 @@ def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
             open_kinds=(),
             period=(2 * seconds, 2 * seconds),
         ),
-        episode=dataclasses.replace(c.episode, length=seconds, stall_time=0.0),
+        episode=dataclasses.replace(c.episode, length=seconds, stall_time=0.0, start_anywhere=0.0),
     )
 
 
