@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cref_jax import evaluation
-from cref_jax.config import Config
+from cref_jax.config import Config, override
 from cref_jax.episode import Ending
 from cref_jax.evaluation import _judged, _Step
 
@@ -65,6 +65,14 @@ def test_share_in_the_air_and_length_of_a_stride():
     assert walk.airborne == (0.5, 0.5)
     # touchdowns seen: left at 10 and 30, right at 20; 40 steps x 2 feet x 0.02 s / 3 = 0.533 s
     assert walk.step_seconds == pytest.approx(1.6 / 3)
+
+
+def test_every_trial_begins_at_the_start_of_its_lane_and_goes_along_it():
+    trained = override(
+        Config(), {"episode": {"start_anywhere": 0.3}, "command": {"lane_free": 0.2}}
+    )
+    c = evaluation.trial_config(trained)
+    assert (c.episode.start_anywhere, c.command.lane_free) == (0.0, 0.0)
 
 
 def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
