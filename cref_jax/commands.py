@@ -40,7 +40,7 @@ class Trace(NamedTuple):
 def judge(
     c: Config, physics: Physics, train: ppo.TrainState, count: int, seed: int
 ) -> dict[str, Any]:
-    """Return what becomes of `count` trials of each command, and of being told to stop."""
+    """Judge `count` trials of each command, and as many of being told to stop."""
     told = np.repeat(np.array([*GRID, STOP], np.float32), count, axis=0)
     steps = round(SECONDS / c.physics.control_period)
     stop = np.full(len(told), steps)
@@ -133,7 +133,7 @@ def _obey(
     stop: Int[Array, " E"],
     steps: int,
 ) -> Trace:
-    """Return what robots do that are told this, and from step `stop` on to stand."""
+    """Walk robots that are told this, and from step `stop` on to stand."""
     nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
 
     def step(carry: tuple[rollout.Robots, Bool[Array, " E"]], k: Int[Array, ""]) -> Any:

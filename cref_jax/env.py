@@ -80,7 +80,7 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
 
 
 def _hidden(world: World, state: EnvState) -> Float[Array, " H"]:
-    """Return what else decides rewards and motion: phases, footholds, a_{t-2}, what was drawn."""
+    """Gather what else decides rewards and motion: phases, footholds, a_{t-2}, what was drawn."""
     gait, dynamics = state.gait, state.dynamics
     row = observation.fine_row(_ground(world, state), state.body.qpos, world.config.scan)
     numbers = (state.since_single, dynamics.friction, dynamics.payload, state.delay)
