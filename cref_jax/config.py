@@ -59,6 +59,7 @@ class RewardWeights:
     feet_contact: float = 1.5
     feet_y_distance: float = 0.1
     foothold_placement: float = 2.0
+    foothold_missed: float = 0.0  # not in Table I
     foot_contact_quality: float = 0.0  # BeamDojo's term, in place of foothold_placement
     base_height: float = 0.8
     linear_velocity_z: float = -1.0
@@ -85,15 +86,11 @@ class Reward:
 
     weights: RewardWeights = field(default_factory=RewardWeights)
     times_dt: bool = True  # assumed: legged_gym's convention
-    event_time: float = (
-        0.25  # s that a touchdown counts for then; assumed: for one control step, as
-    )
-    # legged_gym has it, air time and footholds weigh too little to lengthen a step
+    event_time: float = 0.25  # s that a touchdown counts for then; assumed: one control step, as
+    # legged_gym has it, is too little for air time and footholds to lengthen a step
     clip_at_zero: bool = True  # of all terms but touchdowns; assumed: without it the negative sum
     # at first teaches falling
-    clip_touchdowns: bool = (
-        False  # touchdowns within that cut, too: few samples then lift feet sooner
-    )
+    clip_touchdowns: bool = False  # touchdowns within that cut: few samples then lift feet sooner
     debounce: int = 2  # control steps with contact, or without, until a foot counts as down or up;
     # assumed: a scuff of one step is neither. 1: each contact is a touchdown
     sigma_v: float = 0.25  # m^2/s^2; assumed: legged_gym
@@ -121,15 +118,14 @@ class Command:
     vy: tuple[float, float] = (-0.3, 0.3)  # m/s; assumed
     yaw_rate: tuple[float, float] = (-1.0, 1.0)  # rad/s; assumed
     standing: float = 0.1  # share of standing commands; assumed
+    zero: float = 0.0  # chance of each part of a command in the open to be 0: to turn on the spot
     lane_free: float = 0.1  # share of the commands on a lane that are as in the open; assumed
     period: tuple[float, float] = (8.0, 12.0)  # s between two draws; assumed
     open_kinds: tuple[str, ...] = ("flat",)  # walked in all directions; the rest along a lane
     lane_vx: tuple[float, float] = (0.4, 0.8)  # m/s on terrain, Sec. III-A
     heading_gain: float = 2.0  # 1/s, yaw rate per radian off the lane's direction; assumed
-    lane_gain: float = (
-        1.5  # rad/m, heading per metre off the lane's middle; assumed: with 0.5 robots
-    )
-    # drifted into hand-rails
+    lane_gain: float = 1.5  # rad/m, heading per metre off the lane's middle; assumed: with 0.5
+    # robots drifted into hand-rails
     lane_yaw_rate: float = 0.6  # rad/s, limit of the heading control; assumed
 
 
@@ -221,7 +217,8 @@ class Camera:
     """The depth camera, a RealSense D435i looking down at the ground ahead (Sec. III-A)."""
 
     shape: tuple[int, int] = (48, 64)  # rows, columns, Sec. II-D
-    view: tuple[float, float] = (58.0, 87.0)  # deg, vertical, horizontal; D435i data sheet
+    view: tuple[float, float] = (58.0, 87.0)  # deg, vertical, horizontal; D435i data sheet, for
+    # streams of 16:9; assumed: one of them, squeezed, since those of 4:3 show less, 62 x 75
     d_max: float = 3.0  # m, Sec. II-B; assumed: published work clips at 2 to 3 m
     pitch: float = 50.0  # deg below the horizontal, Sec. III-A
     rate: float = 20.0  # 1/s, Sec. II-D
@@ -284,6 +281,7 @@ class PPO:
     entropy_weight: float = 0.005
     estimator_weight: float = 1.0  # of the velocity estimator's L2 loss
     readout_weight: float = 0.0  # of the loss of telling m_t by the actor's features; the paper: 0
+    mirror_weight: float = 0.0  # of the loss of acting otherwise in the mirror; the paper: 0
     gamma: float = 0.99
     lam: float = 0.95
     learning_rate: float = 1e-3

@@ -364,6 +364,8 @@ def _drawn_command(
     along = jnp.stack([draw(keys[4], c.lane_vx), jnp.zeros(()), jnp.zeros(())])
     is_open = jnp.asarray(np.isin(world.lanes.kinds, c.open_kinds))[kind]
     stands = jax.random.uniform(keys[3]) < jnp.where(is_open, c.standing, 0.5)
+    if c.zero > 0.0:
+        free *= jax.random.uniform(jax.random.fold_in(key, len(keys)), (3,)) >= c.zero
     free = jnp.where(stands, jnp.zeros(3), free)
     is_steered = ~is_open & (jax.random.uniform(keys[5]) >= c.lane_free)
     return jnp.where(is_steered, along, free), is_steered

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import lanes, ppo, rollout, shapes, trials
+from cref_jax import lanes, ppo, rollout, shapes, sideways, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
+from cref_jax.sideways import Sideways
 from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
@@ -31,6 +32,7 @@ class Walk(NamedTuple):
     tracking_error: float  # m/s, of the planar velocity at each step
     airborne: tuple[float, float]  # share of time that the left and the right foot are off ground
     step_seconds: float  # mean time between two touchdowns of one foot
+    sideways: Sideways
 
     def line(self) -> str:
         """Return the outcome in one line for people."""
@@ -53,6 +55,7 @@ class Crossing(NamedTuple):
     by_cause: dict[str, int]  # of the failures
     seconds: float  # mean time of a success
     speed: float  # m/s forward, mean over the trials
+    sideways: Sideways | None = None  # None for a robot in another simulation
 
     def line(self) -> str:
         """Return the outcome in one line for people."""
@@ -72,6 +75,7 @@ class _Step(NamedTuple):
     forward_error: Float[Array, " E"]
     tracking_error: Float[Array, " E"]
     airborne: Bool[Array, "E F"]
+    y: Float[Array, " E"]  # m, before the step
 
 
 def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
@@ -126,6 +130,7 @@ def cross(
         by_cause=made.failures(),
         seconds=float(made.seconds[done].mean()) if done.any() else float("nan"),
         speed=float(made.forward.mean()),
+        sideways=sideways.summed(made.drift, made.aside),
     )
 
 
@@ -173,9 +178,9 @@ def _episodes(
     def step(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
     ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _Step]]:
-        robots, alive = carry
-        memory, policy = rollout.act(nets, train, robots)
-        robots, outcome = rollout.advance(world, robots, memory, policy.mean[0])
+        before, alive = carry
+        memory, policy = rollout.act(nets, train, before)
+        robots, outcome = rollout.advance(world, before, memory, policy.mean[0])
         measures, ending = outcome.measures, outcome.ending
         counted = Ending(*(flag & alive for flag in ending))
         seen = _Step(
@@ -184,6 +189,7 @@ def _episodes(
             forward_error=measures.forward_command - measures.forward_speed,
             tracking_error=measures.speed_error,
             airborne=measures.airborne,
+            y=before.env.body.qpos[:, 1],
         )
         return (robots, alive & ~ending.terminated & ~ending.truncated), (counted, seen)
 
@@ -214,4 +220,5 @@ def _judged(ending: Ending, trace: _Step, c: Config) -> Walk:
         tracking_error=float(of_episode(trace.tracking_error).mean()),
         airborne=(float(airborne[0]), float(airborne[1])),
         step_seconds=float(seconds / max(touchdowns, 1)),
+        sideways=sideways.summed(*sideways.spans(trace.y, alive)),
     )

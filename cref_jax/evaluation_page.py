@@ -22,6 +22,7 @@ TITLES = {
     "ood": "Success on scenes that were never trained on",
     "walk": "Walking on flat ground",
     "cross": "Crossing obstacles",
+    "commands": "Doing what it is told, on flat ground",
 }
 PLAIN = {  # of the suites walk and cross: name in the record: words, and unit
     "kind": ("kind of obstacle", ""),
@@ -91,6 +92,11 @@ def _sections(record: Record) -> Iterator[Section]:
             yield Section("Success by commanded speed", _speeds(cells))
     if record.get("scenes"):
         yield Section("Scenes", _scenes(record["scenes"]))
+    places = [of for of in (*cells, *(record.get("scenes") or [])) if of.get("sideways")]
+    if places or record.get("sideways"):
+        yield Section("Across the way", _sideways(places or [record]))
+    if record.get("commands"):
+        yield Section("Commands", _commands(record["commands"]))
     if record.get("conditions"):
         yield Section("Conditions", _conditions(record["conditions"]))
     plain = _plain(record)
@@ -116,6 +122,12 @@ def _tiles(record: Record) -> Iterator[tuple[str, str]]:
     if record.get("suite") == "walk":
         stood = record["episodes"] - record["fell"]
         yield f"{stood} of {record['episodes']}", "episodes without a fall"
+    if record.get("suite") == "commands":
+        stand, stop = record["commands"][0], record["stop"]
+        yield f"{stand['stood']} of {stand['trials']}", "told to stand, move less than 5 cm"
+        yield f"{stand['still']} of {stand['trials']}", "told to stand, take no step after 2 s"
+        if stop["distance_m"] is not None:
+            yield f"{100.0 * stop['distance_m']:.0f} cm", "further at 0.6 m/s when told to stop"
     if record.get("suite") == "cross":
         rate = _percent(record["successes"] / record["trials"])
         yield rate, f"of {record['trials']} trials come to the lane's end"
@@ -242,6 +254,38 @@ def _conditions(conditions: Sequence[Record]) -> Html:
         for c in conditions
     ]
     return page.table(columns, rows)
+
+
+def _sideways(places: Sequence[Record]) -> Html:
+    """Return how far robots drift, and how near to the way's side they come, cm."""
+    columns = [Column("where")]
+    columns += [Column(n, True) for n in ("drift", "largest |y|, mean", "largest |y| of all")]
+    keys = ("drift_m", "largest_m", "worst_m")
+    place = lambda of: _called(of) if "title" in of else _name(of) or "flat ground"
+    rows = [(place(of), *(f"{100.0 * of['sideways'][k]:.0f} cm" for k in keys)) for of in places]
+    said = (
+        "Drift is |y| at the end less y at the start, y = 0 the middle of the way; means of trials."
+    )
+    return join(paragraph(said), page.table(columns, rows))
+
+
+def _commands(rows: Sequence[Record]) -> Html:
+    """Return how each command was obeyed."""
+    columns = [Column("told: forward, left m/s, turn rad/s")]
+    columns += [Column(n, True) for n in ("does", "error", "fell", "feet up, left and right")]
+    said = lambda values: MISSING if values is None else ", ".join(f"{x:.2f}" for x in values)
+    shares = lambda values: MISSING if values is None else ", ".join(map(_percent, values))
+    table = [
+        (
+            said(r["command"]),
+            said(r["velocity"]),
+            said(r["error"]),
+            f"{r['fell']} of {r['trials']}",
+            shares(r["airborne"]),
+        )
+        for r in rows
+    ]
+    return page.table(columns, table)
 
 
 def _plain(record: Record) -> Html:

@@ -17,7 +17,7 @@ class Options:
     """Write a trained policy as a directory that numpy alone can run."""
 
     run: Path | None = None
-    """runs/NAME; the newest one when left out"""
+    """runs/NAME, or what --learner wrote; the newest run when left out"""
     out: Path = Path("policy")
     """the directory; the same as one file is written to the directory's name with .zip"""
     learner: Path | None = None
@@ -53,9 +53,11 @@ def main(arguments: list[str] | None = None) -> None:
 def _export(options: Options) -> None:
     """Write the run's newest policy."""
     run = options.run or runs.newest()
-    world = runs.world_of(runs.read_config(run), "mujoco")
+    from_file = learner.is_learner(run)
+    world = runs.world_of((learner if from_file else runs).read_config(run), "mujoco")
     print(f"exporting {run} ...", flush=True)
-    exported.write(runs.load_policy(run, world), world, options.out)
+    policy = learner.read(run, world) if from_file else runs.load_policy(run, world)
+    exported.write(policy, world, options.out)
 
 
 def _write_learner(run: Path, out: Path) -> None:

@@ -296,7 +296,8 @@ def _depth(c: Config) -> dict[str, Any]:
         "d_max_m": c.camera.d_max,
         "invalid": "0 and NaN are filled in from around; infinity and beyond d_max read as d_max",
         "window": c.camera.window,
-        "resize": "the pixel nearest to each cell's middle, of an image with this view",
+        "resize": "the pixel nearest to each cell's middle, of an image with this view; a RealSense"
+        " D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees",
         "formula": "float16(nearest / d_max - 0.5), nearest: of window x window pixels around",
     }
 

@@ -17,7 +17,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, PyTree
 
-from cref_jax import ppo, ramp, rollout
+from cref_jax import mirror, ppo, ramp, rollout
+from cref_jax.losses import Losses
 from cref_jax.ramp import Ramp
 from cref_jax.world import World
 
@@ -48,7 +49,8 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     key_robots, key_params = jax.random.split(jax.random.key(c.run.seed))
 
     def start(world: World, key: Array) -> rollout.Robots:
-        return rollout.start(world, _own(key), c.run.num_envs // mesh.size)
+        robots = rollout.start(world, _own(key), c.run.num_envs // mesh.size)
+        return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
     shared = jax.shard_map(
         start,
@@ -95,10 +97,10 @@ def chunk(world: World, state: RunState, mesh: Mesh, iterations: int) -> tuple[R
 def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[RunState, Log]:
     c = world.config
     nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
+    if c.ppo.mirror_weight:
+        nets = nets._replace(mirror=mirror.of(world.physics.model, c.network))
 
-    def learn(
-        world: World, state: RunState, key: Array
-    ) -> tuple[RunState, ppo.Losses, rollout.Trace]:
+    def learn(world: World, state: RunState, key: Array) -> tuple[RunState, Losses, rollout.Trace]:
         key_act, key_update = jax.random.split(_own(key))
         robots = rollout.hardened(state.robots, state.ramp.share)
         robots, experience, trace = rollout.collect(world, nets, state.train, robots, key_act)
@@ -133,7 +135,8 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
 
 def partition(world: World) -> RunState:
     """Return how a run's state is shared out: the robots are, and what is learned is not."""
-    robots = rollout.partition(AXIS, world.config.network.variant)
+    c = world.config
+    robots = rollout.partition(AXIS, c.network.variant, c.ppo.mirror_weight > 0.0)
     return RunState(train=P(), robots=robots, ramp=P())
 
 

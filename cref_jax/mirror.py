@@ -5,6 +5,7 @@ and images are turned over. The robot and every lane that is level across are th
 image, so what a state does in a step is what its mirror image does, mirrored.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float16, Int
 
 from cref_jax import config, network, observation
+from cref_jax.losses import Mirror
 from cref_jax.physics import Body
 
 POLAR = np.array([1.0, -1.0, 1.0], np.float32)  # of a velocity, a force, a place
@@ -49,6 +51,18 @@ def joints(model: mujoco.MjModel) -> Joints:
     if not np.allclose(np.abs(sign), 1.0, atol=1e-6):
         raise ValueError(f"{names[int(np.abs(sign).argmin())]} does not turn about a mirrored axis")
     return Joints(partner, np.sign(sign).astype(np.float32))
+
+
+def of(model: mujoco.MjModel, c: config.Network) -> Mirror:
+    """Return the mirror of this robot for the actor of this network."""
+    legs = joints(model)
+    turned = functools.partial(frame, c=c)
+    return Mirror(
+        obs=lambda seen: proprioception(seen, legs),
+        frames=turned,
+        sight=lambda sight: sight and sight.replace(frames=turned(sight.frames)),
+        action=legs.flipped,
+    )
 
 
 def body(state: Body, of: Joints) -> Body:

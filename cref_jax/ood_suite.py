@@ -23,7 +23,17 @@ from cref_jax.film import write_video  # before mujoco, whose OpenGL it chooses
 import numpy as np
 from rich.progress import track
 
-from cref_jax import evaluation, exported, ood, ood_verdict, processes, robot, scene, stand_in
+from cref_jax import (
+    evaluation,
+    exported,
+    ood,
+    ood_verdict,
+    processes,
+    robot,
+    scene,
+    sideways,
+    stand_in,
+)
 from cref_jax.config import Config, ConfigError
 from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
@@ -163,7 +173,10 @@ class _Runner:
     def __call__(self, job: _Job) -> Outcome:
         """Return what a trial is counted by."""
         t = self.trial(job)
-        return Outcome(t.ending, t.seconds, t.progress, t.speed, t.status)
+        drift, aside = sideways.spans(t.qpos[:, 1:2])
+        return Outcome(
+            t.ending, t.seconds, t.progress, t.speed, t.status, float(drift[0]), float(aside[0])
+        )
 
     def trial(self, job: _Job) -> Trial:
         """Return the trial."""

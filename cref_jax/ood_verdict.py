@@ -12,6 +12,7 @@ from cref_jax import robot
 from cref_jax.deploy import Status
 from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.proportion import wilson
+from cref_jax.sideways import summed
 
 PASSED = 0.5  # share of a scene's trials that must come to its end; assumed: the paper counts
 # scenes, and does not say what it takes
@@ -38,6 +39,8 @@ class Outcome(NamedTuple):
     progress: float  # m
     speed: float  # m/s
     status: Status
+    drift: float  # m, see sideways.spans
+    aside: float  # m
 
 
 class SceneResult(NamedTuple):
@@ -53,6 +56,7 @@ class SceneResult(NamedTuple):
     wilson_high: float
     seconds: float | None  # mean time of a success
     passed: bool
+    sideways: dict[str, float]  # m, see sideways.Sideways
 
 
 class ConditionResult(NamedTuple):
@@ -123,6 +127,9 @@ def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneRes
         wilson_high=rate.high,
         seconds=float(np.mean(seconds)) if seconds else None,
         passed=is_passed(outcomes),
+        sideways=summed(
+            np.array([o.drift for o in outcomes]), np.array([o.aside for o in outcomes])
+        )._asdict(),
     )
 
 

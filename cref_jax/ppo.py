@@ -7,8 +7,7 @@ Samples that are not `valid` count in no loss and in no statistic, whatever they
 
 import contextlib
 import io
-from collections.abc import Callable
-from typing import NamedTuple, Protocol, no_type_check
+from typing import NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped
 
-from cref_jax import config, gaussian, readout
-from cref_jax.readout import Readout
+from cref_jax import config
+from cref_jax.losses import Batch, Losses, Networks, Params, agreed, loss, mean_valid
 
 with contextlib.redirect_stdout(io.StringIO()):  # brax loads MJX, which says that warp is missing
     from brax.training.acme import running_statistics
@@ -28,32 +27,6 @@ _VARIANCE_FLOOR = 1e-4  # added to each input's variance; assumed: a constant in
 _RATE_FACTOR = 1.5  # one adaptation of the learning rate; assumed: the usual factor
 _KL_BAND = 2.0  # the rate rests while the KL is within this factor of its target; assumed: usual
 _NEVER = 2**31 - 1  # bad gradients in a row before one is applied: when to stop is the caller's
-
-
-class Prediction(Protocol):
-    """What an actor says: a Gaussian over actions, and what it takes its velocity for."""
-
-    mean: Float[Array, "T E J"]
-    log_std: Float[Array, " J"]
-    velocity: Float[Array, "T E V"]
-    feature: Float[Array, "T E D"]  # that the mean is read off; only a readout looks at it
-
-
-class Networks(NamedTuple):
-    """The two functions that are trained. They take normalised observations."""
-
-    # (params, carry, obs [T, E, O], begins [T, E], sight) -> (carry, prediction)
-    actor: Callable[[PyTree, PyTree, Array, Array, PyTree], tuple[PyTree, Prediction]]
-    # (params, critic_obs [T, E, S]) -> value [T, E]
-    critic: Callable[[PyTree, Array], Array]
-
-
-class Params(NamedTuple):
-    """What the optimiser changes."""
-
-    actor: PyTree
-    critic: PyTree
-    readout: Readout | None = None  # of the last M of the critic's observations
 
 
 class Statistics(NamedTuple):
@@ -93,39 +66,7 @@ class Rollout(NamedTuple):
     valid: Bool[Array, "T E"]  # False where the simulation failed; the next step must begin anew
     carry: PyTree[Float[Array, "E ?H"]]  # the actor's memory before the first step
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # what the actor looks at besides, as it is
-
-
-class Batch(NamedTuple):
-    """What the loss looks at: a rollout normalised, judged and free of invalid numbers."""
-
-    obs: Float[Array, "T E O"]
-    critic_obs: Float[Array, "T E S"]
-    velocity: Float[Array, "T E V"]
-    action: Float[Array, "T E J"]
-    mean: Float[Array, "T E J"]
-    log_std: Float[Array, "T E J"]
-    value: Float[Array, "T E"]
-    advantage: Float[Array, "T E"]  # mean 0 and deviation 1 over the valid samples
-    returns: Float[Array, "T E"]
-    begins: Bool[Array, "T E"]
-    valid: Bool[Array, "T E"]
-    carry: PyTree[Float[Array, "E ?H"]]
-    sight: PyTree[Shaped[Array, "?K E *?n"]] = None
-
-
-class Losses(NamedTuple):
-    """Unweighted parts of the loss of one minibatch, and how the step went."""
-
-    surrogate: Float[Array, "*n"]
-    value: Float[Array, "*n"]
-    velocity: Float[Array, "*n"]  # m^2/s^2
-    readout: Float[Array, "*n"]  # in variances of what is read out
-    entropy: Float[Array, "*n"]  # nats
-    kl: Float[Array, "*n"]  # nats, of the behaviour policy from the present one
-    clipped: Float[Array, "*n"]  # share of samples whose ratio is outside the clip range
-    gradient_norm: Float[Array, "*n"] | float = 0.0  # before clipping
-    learning_rate: Float[Array, "*n"] | float = 0.0
-    skipped: Float[Array, "*n"] | float = 0.0  # 1 where the gradient was not finite
+    twin: PyTree[Float[Array, "E ?H"]] = None  # the memory of an actor that lives in the mirror
 
 
 def initial_state(params: Params, obs_size: int, critic_obs_size: int, c: config.PPO) -> TrainState:
@@ -168,10 +109,13 @@ def update(
     every gradient, and learn as one device would from all the rollouts.
     """
     batch = judge(state.statistics, rollout, c, axis)
+    if networks.mirror is not None:
+        mirrored = networks.mirror.obs(_zero_invalid(rollout).obs)
+        batch = batch._replace(twin_obs=normalise(state.statistics.obs, mirrored))
 
     def on_batch(state: TrainState, batch: Batch) -> tuple[TrainState, Losses]:
         grads, losses = jax.grad(loss, has_aux=True)(state.params, batch, c, networks, axis)
-        grads, losses = _agreed((grads, losses), axis)
+        grads, losses = agreed((grads, losses), axis)
         return _descend(state, grads, losses, c)
 
     def on_epoch(state: TrainState, key: PRNGKeyArray) -> tuple[TrainState, Losses]:
@@ -206,7 +150,7 @@ def judge(
         c.gamma,
         c.lam,
     )
-    mean = lambda x: _agreed(_mean(x, clean.valid, axis), axis)
+    mean = lambda x: agreed(mean_valid(x, clean.valid, axis), axis)
     centred = advantage - mean(advantage)
     deviation = jnp.sqrt(mean(jnp.square(centred)))
     return Batch(
@@ -223,6 +167,7 @@ def judge(
         valid=clean.valid,
         carry=clean.carry,
         sight=clean.sight,
+        twin=clean.twin,
     )
 
 
@@ -263,60 +208,10 @@ def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:
     if num_envs % count:
         raise ValueError(f"{num_envs} environments do not split into {count} equal minibatches")
     order = jax.random.permutation(key, num_envs).reshape(count, num_envs // count)
-    split = jax.tree.map(lambda x: jnp.moveaxis(x[:, order], 1, 0), batch._replace(carry=()))
-    return split._replace(carry=jax.tree.map(lambda x: x[order], batch.carry))
-
-
-def loss(
-    params: Params, batch: Batch, c: config.PPO, networks: Networks, axis: str | None = None
-) -> tuple[Float[Array, ""], Losses]:
-    """Return the weighted loss of a minibatch, and its parts; `axis` is as in `_mean`."""
-    mean = lambda x: _mean(x, batch.valid, axis)
-    _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins, batch.sight)
-    value = networks.critic(params.critic, batch.critic_obs)
-    new = gaussian.log_prob(batch.action, policy.mean, policy.log_std)
-    old = gaussian.log_prob(batch.action, batch.mean, batch.log_std)
-    ratio = jnp.exp(jnp.where(batch.valid, new - old, 0.0))
-    divergence = gaussian.kl(batch.mean, batch.log_std, policy.mean, policy.log_std)
-    error = jnp.sum(jnp.square(policy.velocity - batch.velocity), axis=-1)
-    misread = jnp.zeros_like(value)
-    if params.readout is not None:
-        misread = readout.error(params.readout, policy.feature, batch.critic_obs)
-    parts = Losses(
-        surrogate=mean(surrogate(ratio, batch.advantage, c.clip)),
-        value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),
-        velocity=mean(error),
-        readout=mean(misread),
-        entropy=gaussian.entropy(policy.log_std),
-        kl=mean(divergence),
-        clipped=mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype)),
-    )
-    total = (
-        parts.surrogate
-        + c.value_weight * parts.value
-        + c.estimator_weight * parts.velocity
-        + c.readout_weight * parts.readout
-        - c.entropy_weight * parts.entropy
-    )
-    return total, jax.lax.stop_gradient(parts)
-
-
-def surrogate(
-    ratio: Float[Array, "T E"], advantage: Float[Array, "T E"], clip: float
-) -> Float[Array, "T E"]:
-    """Return -min(r A, clip(r, 1 - clip, 1 + clip) A), the pessimistic policy loss."""
-    return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
-
-
-def value_error(
-    value: Float[Array, "T E"],
-    old: Float[Array, "T E"],
-    returns: Float[Array, "T E"],
-    clip: float,
-) -> Float[Array, "T E"]:
-    """Return the squared error of V, or of V held within `clip` of the old one if that is worse."""
-    held = old + jnp.clip(value - old, -clip, clip)
-    return jnp.maximum(jnp.square(value - returns), jnp.square(held - returns))
+    in_time = batch._replace(carry=(), twin=())
+    split = jax.tree.map(lambda x: jnp.moveaxis(x[:, order], 1, 0), in_time)
+    carry, twin = jax.tree.map(lambda x: x[order], (batch.carry, batch.twin))
+    return split._replace(carry=carry, twin=twin)
 
 
 def adapt(rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO) -> Float[Array, ""]:
@@ -345,7 +240,7 @@ def observe(
     """Return the statistics with the valid samples, of all devices, counted in."""
     clean, weights = jnp.where(valid[..., None], x, 0.0), valid.astype(x.dtype)
     after = running_statistics.update(statistics, clean, weights=weights, pmap_axis_name=axis)
-    some = _agreed(weights.mean(), axis) > 0.0
+    some = agreed(weights.mean(), axis) > 0.0
     return jax.tree.map(lambda new, old: jnp.where(some, new, old), after, statistics)
 
 
@@ -373,22 +268,6 @@ def _descend(
     )
 
 
-def _mean(
-    x: Float[Array, "T E"], valid: Bool[Array, "T E"], axis: str | None = None
-) -> Float[Array, ""]:
-    """Return the mean over the valid samples, 0 if there are none.
-
-    With an `axis`, what `_agreed` makes the mean over the samples of all devices.
-    """
-    count = _agreed(jnp.sum(valid).astype(x.dtype), axis)
-    return jnp.sum(jnp.where(valid, x, 0.0)) / jnp.where(count > 0.0, count, 1.0)
-
-
-def _agreed(x: PyTree, axis: str | None) -> PyTree:
-    """Return the mean over the devices."""
-    return x if axis is None else jax.lax.pmean(x, axis)
-
-
 def _zero_invalid(rollout: Rollout) -> Rollout:
     """Return the rollout with zeros in place of the numbers of invalid samples."""
 
@@ -396,5 +275,6 @@ def _zero_invalid(rollout: Rollout) -> Rollout:
         valid = rollout.valid.reshape(rollout.valid.shape + (1,) * (x.ndim - 2))
         return jnp.where(valid, x, jnp.zeros_like(x))
 
-    clean = jax.tree.map(keep, rollout._replace(carry=(), sight=()))
-    return clean._replace(begins=rollout.begins, carry=rollout.carry, sight=rollout.sight)
+    apart = {name: getattr(rollout, name) for name in ("carry", "sight", "twin")}
+    clean = jax.tree.map(keep, rollout._replace(carry=(), sight=(), twin=()))
+    return clean._replace(begins=rollout.begins, **apart)

@@ -102,6 +102,15 @@ def foothold_placement(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Arr
     return jnp.sum(s.first_contact * jnp.exp(-s.foothold_distance / c.foothold_tolerance))
 
 
+def foothold_missed(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """Sum over feet of I_td (1 - exp(-d_xz / s_xz)), 0 without a candidate; not in Table I.
+
+    With it footholds can weigh more without paying for more steps, as their reward alone does.
+    """
+    missed = 1.0 - jnp.exp(-s.foothold_distance / c.foothold_tolerance)
+    return jnp.sum(s.first_contact * jnp.isfinite(s.foothold_distance) * missed)
+
+
 def foot_contact_quality(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """Sum over feet of C_i sum_j I(d_ij < epsilon), BeamDojo's term (arXiv 2502.10363)."""
     return jnp.sum(is_touching(s.foot_force, c) * s.unsupported).astype(jnp.float32)
@@ -212,6 +221,7 @@ TERMS: dict[str, Term] = {
         feet_contact,
         feet_y_distance,
         foothold_placement,
+        foothold_missed,
         foot_contact_quality,
         base_height,
         linear_velocity_z,
@@ -234,7 +244,7 @@ TERMS: dict[str, Term] = {
 }
 
 # not 0 in the step of a touchdown alone
-EVENTS = ("foothold_placement", "feet_air_time", "air_time_variance")
+EVENTS = ("foothold_placement", "foothold_missed", "feet_air_time", "air_time_variance")
 
 
 def total(

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, kernels, network, ppo, readout
+from cref_jax import config, depth, env, episode, kernels, losses, network, ppo, readout
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
@@ -41,6 +41,7 @@ class Memory(NamedTuple):
 
     carry: network.Carry
     features: network.Features | None  # of the frame at hand, [1, E, ...]; None for a blind policy
+    twin: "Memory | None" = None  # of the same policy in the mirror, where it is taught symmetry
 
 
 @no_type_check
@@ -60,11 +61,12 @@ class Networks(NamedTuple):
 
     actor: network.Actor
     critic: network.Critic
+    mirror: losses.Mirror | None = None  # the symmetry that the actor is taught, if any
 
     @property
-    def functions(self) -> ppo.Networks:
+    def functions(self) -> losses.Networks:
         """The same as functions of their parameters."""
-        return ppo.Networks(actor=self.actor.apply, critic=self.critic.apply)
+        return losses.Networks(self.actor.apply, self.critic.apply, self.mirror)
 
 
 class _Step(NamedTuple):
@@ -88,13 +90,14 @@ class Trace(NamedTuple):
     measures: env.Measures
 
 
-def partition(axis: str, variant: config.Variant) -> Robots:
+def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Robots:
     """Return which axis of each array is that of the robots, named `axis`; clocks have none."""
     sees, robots = variant != "blind", P(axis)
+    memory = Memory(robots, P(None, axis) if sees else None)
     return Robots(
         env=robots,
         observation=robots,
-        memory=Memory(robots, P(None, axis) if sees else None),
+        memory=memory._replace(twin=memory if has_twin else None),
         begins=robots,
         feed=Feed(frame=robots, seen=robots, fresh=P(), clock=P()) if sees else None,
     )
@@ -107,7 +110,7 @@ def networks(c: config.Network, num_actions: int) -> Networks:
 
 def initial_params(
     c: config.Config, num_actions: int, robots: Robots, key: PRNGKeyArray
-) -> ppo.Params:
+) -> losses.Params:
     """Return fresh parameters for observations of the robots' shapes."""
     key_actor, key_critic = jax.random.split(key)
     one = lambda x: x[None, :1]
@@ -120,7 +123,7 @@ def initial_params(
         key_actor, carry, one(seen.proprioception), begins, sight
     )
     shape = said.feature.shape[-1], c.scan.x[2] * c.scan.y[2]
-    return ppo.Params(
+    return losses.Params(
         actor=actor,
         critic=nets.critic.init(key_critic, one(seen.privileged)),
         readout=readout.untaught(*shape) if c.ppo.readout_weight else None,
@@ -164,20 +167,45 @@ def hardened(robots: Robots, share: Float[Array, ""]) -> Robots:
     return robots.replace(env=robots.env.replace(spread=spread))
 
 
+def with_twins(robots: Robots) -> Robots:
+    """Return the robots with an empty memory of the same policy in the mirror."""
+    blank = jax.tree.map(jnp.zeros_like, robots.memory)
+    return robots.replace(memory=robots.memory._replace(twin=blank))
+
+
 def act(nets: Networks, train: ppo.TrainState, robots: Robots) -> tuple[Memory, network.Output]:
     """Return the policy's memory after this step and its outputs, [1, E, ...].
 
-    A frame is encoded when it comes, and its features are held until the next one.
+    A frame is encoded when it comes, and its features are held until the next one. Where the policy
+    is taught symmetry, its twin senses and sees the same in the mirror, and remembers that.
     """
-    params, feed, (carry, features) = train.params.actor, robots.feed, robots.memory
-    obs = ppo.normalise(train.statistics.obs, robots.observation.proprioception)
+    seen, feed, memory = robots.observation.proprioception, robots.feed, robots.memory
+    after, output = _think(nets, train, robots.begins, seen, feed, memory)
+    if nets.mirror is not None and memory.twin is not None:
+        reflected = feed and feed.replace(frame=nets.mirror.frames(feed.frame))
+        twin, _ = _think(nets, train, robots.begins, nets.mirror.obs(seen), reflected, memory.twin)
+        after = after._replace(twin=twin)
+    return after, output
+
+
+def _think(
+    nets: Networks,
+    train: ppo.TrainState,
+    begins: Bool[Array, " E"],
+    proprioception: Float[Array, "E O"],
+    feed: Feed | None,
+    memory: Memory,
+) -> tuple[Memory, network.Output]:
+    """Do what `act` does for one memory."""
+    params, features = train.params.actor, memory.features
+    obs = ppo.normalise(train.statistics.obs, proprioception)
     view = None
     if feed is not None:
         encode = lambda: nets.actor.apply(params, feed.frame[None], method="encode")
         features = jax.lax.cond(feed.fresh, encode, lambda: features)
         view = network.View(features, jnp.zeros_like(feed.seen[None], jnp.int32), feed.seen[None])
     carry, output = nets.actor.apply(
-        params, carry, obs[None], robots.begins[None], view, method="decide"
+        params, memory.carry, obs[None], begins[None], view, method="decide"
     )
     return Memory(carry, features), output
 
@@ -248,12 +276,16 @@ def collect(
     draw = lambda key: jax.random.normal(key, robots.env.action.shape)
     watch, steps = jax.lax.scan(step, _opened(c, robots), jax.vmap(draw)(keys))
     after = watch.robots
-    if after.feed is not None:
-        blank = jax.tree.map(jnp.zeros_like, after.memory.features)
-        after = after.replace(memory=after.memory._replace(features=blank))
-    rollout = _rollout(c, nets, train, first.memory.carry, watch.album, steps)
+    after = after.replace(memory=_without_features(after.memory))
+    rollout = _rollout(c, nets, train, first.memory, watch.album, steps)
     outcome = steps.outcome
     return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
+
+
+def _without_features(memory: Memory) -> Memory:
+    """Return what is remembered, with blank features of the frame at hand."""
+    twin = memory.twin and _without_features(memory.twin)
+    return memory._replace(features=jax.tree.map(jnp.zeros_like, memory.features), twin=twin)
 
 
 @no_type_check
@@ -290,7 +322,7 @@ def _rollout(
     c: config.Config,
     nets: Networks,
     train: ppo.TrainState,
-    carry: network.Carry,
+    memory: Memory,
     album: Float16[Array, "K E rows columns pixels"] | None,
     steps: _Step,
 ) -> ppo.Rollout:
@@ -317,8 +349,9 @@ def _rollout(
         truncated=outcome.ending.truncated,
         begins=steps.begins,
         valid=~outcome.ending.unstable,
-        carry=carry,
+        carry=memory.carry,
         sight=sight,
+        twin=memory.twin and memory.twin.carry,
     )
 
 

@@ -19,7 +19,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import depth, episode, ppo, rollout, stall
+from cref_jax import depth, episode, ppo, rollout, sideways, stall
 from cref_jax.config import Config
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending
@@ -51,6 +51,8 @@ class Trials(NamedTuple):
     ending: Int[np.ndarray, " N"]  # index into ENDINGS
     seconds: Float[np.ndarray, " N"]
     forward: Float[np.ndarray, " N"]  # m/s, mean speed in the body frame
+    drift: Float[np.ndarray, " N"]  # m, across the lane from the start to the end, either way
+    aside: Float[np.ndarray, " N"]  # m, the largest distance from the lane's middle
 
     @property
     def succeeded(self) -> Bool[np.ndarray, " N"]:
@@ -68,6 +70,7 @@ class Trace(NamedTuple):
     ending: Ending  # [T, E] each
     progress: Float[Array | np.ndarray, "T E"]  # m from the start along the lane
     forward: Float[Array | np.ndarray, "T E"]  # m/s, body frame
+    y: Float[Array | np.ndarray, "T E"]  # m across the lane, before the step
 
 
 def follow(train: ppo.TrainState) -> Walker:
@@ -147,11 +150,14 @@ def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trial
         ENDINGS.index("late"),
     )
     lived = np.arange(steps)[:, None] <= last
+    drift, aside = sideways.spans(np.asarray(trace.y), lived)
     return Trials(
         speed=speed,
         ending=ending,
         seconds=(last + 1) * period,
         forward=np.sum(trace.forward * lived, axis=0) / (last + 1),
+        drift=drift,
+        aside=aside,
     )
 
 
@@ -277,9 +283,10 @@ def _steps(world: World, walker: Walker, robots: Robots, mesh: Mesh) -> tuple[Ro
 
     def advance(world: World, walker: Walker, robots: Robots) -> tuple[Robots, Trace]:
         def step(robots: Robots, _: None) -> tuple[Robots, Trace]:
+            y = robots.env.body.qpos[:, 1]
             robots, outcome = walker(world, robots)
             m = outcome.measures
-            return robots, Trace(outcome.ending, m.progress, m.forward_speed)
+            return robots, Trace(outcome.ending, m.progress, m.forward_speed, y)
 
         return jax.lax.scan(step, robots, None, length=CHUNK)
 

@@ -56,6 +56,7 @@ def cell(kind: str, number: int, policies: int) -> dict[str, Any]:
             }
             for k, n in enumerate(speeds)
         ],
+        "sideways": {"drift_m": 0.11, "largest_m": 0.22 + 0.01 * number, "worst_m": 0.57},
         "by_policy": [rate + 0.013 * (k - (policies - 1) / 2) for k in range(policies)],
         "spread": None if policies == 1 else 0.013,
         "paper": {
@@ -108,6 +109,7 @@ def ood() -> dict[str, Any]:
             "wilson_low": (39 - 5 * k) / 40 - 0.11,
             "wilson_high": min(1.0, (39 - 5 * k) / 40 + 0.09),
             "failures": {"tilted": 1 + 3 * k, "stalled": 2 * k},
+            "sideways": {"drift_m": 0.13, "largest_m": 0.31 + 0.01 * k, "worst_m": 0.68},
         }
         for k in range(6)
     ]
@@ -143,6 +145,33 @@ WALK = {
     "tracking_error": 0.118267,
     "airborne": [0.342862, 0.312355],
     "step_seconds": 0.244458,
+    "sideways": {"drift_m": 0.141, "largest_m": 0.262, "worst_m": 0.383},
+}
+COMMANDS = {
+    "suite": "commands",
+    "seed": 0,
+    "commands": [
+        {
+            "command": [0.0, 0.0, 0.0],
+            "trials": 40,
+            "fell": 1,
+            "velocity": [0.012, -0.003, 0.021],
+            "error": [0.014, 0.015, 0.022],
+            "airborne": [0.16, 0.17],
+            "stood": 33,
+            "still": 29,
+            "drift_m": 0.03,
+        },
+        {
+            "command": [0.6, 0.0, 0.0],
+            "trials": 40,
+            "fell": 40,
+            "velocity": None,
+            "error": None,
+            "airborne": None,
+        },
+    ],
+    "stop": {"trials": 40, "fell": 2, "distance_m": 0.418},
 }
 CROSS = {
     "suite": "cross",

@@ -146,6 +146,21 @@ def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, r
         assert np.ptp(free[:, column]) > 0.8 * (high - low)
 
 
+def test_parts_of_a_command_in_the_open_are_0_at_times(world, resets):
+    c = config.override(C, {"command": {"zero": 0.5, "standing": 0.0}})
+    draw = jax.vmap(episode._drawn_command, in_axes=(None, 0, None))
+    keys, flat = jax.random.split(jax.random.key(4), 2000), world.lanes.kinds.index("flat")
+    command, _ = draw(world.replace(config=c), keys, jnp.int32(flat))
+    is_zero = np.asarray(command) == 0.0
+    np.testing.assert_allclose(is_zero.mean(axis=0), 0.5, atol=0.05)
+    on_the_spot = is_zero[:, 0] & is_zero[:, 1] & ~is_zero[:, 2]
+    assert on_the_spot.mean() == pytest.approx(0.125, abs=0.03)  # a half of a half of a half
+    before, _ = draw(world, keys, jnp.int32(flat))  # the others are drawn as ever
+    stands = (np.asarray(before) == 0.0).all(axis=1)
+    moves = ~is_zero & ~stands[:, None]
+    np.testing.assert_array_equal(np.asarray(command)[moves], np.asarray(before)[moves])
+
+
 def commanded(world, state, seed=0):
     draws = episode.draw(world, state, jax.random.key(9), jax.random.key(seed))
     return episode.commanded(world, state, draws)

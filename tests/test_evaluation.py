@@ -16,6 +16,7 @@ def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _Step:
         forward_error=np.full(alive.shape, error, np.float32),
         tracking_error=np.full(alive.shape, abs(error), np.float32),
         airborne=airborne,
+        y=np.arange(alive.shape[0])[:, None] * np.full(alive.shape[1], 0.1, np.float32),
     )
 
 
@@ -47,6 +48,8 @@ def test_what_comes_after_a_fall_does_not_count():
     error = np.array([[0.2, 0.4], [0.2, 0.4], [9.0, 0.4], [9.0, 0.4]], np.float32)
     walk = _judged(ending(2), seen._replace(forward_error=error), Config())
     assert walk.speed_error == pytest.approx(0.3)  # (0.2 + 0.4) / 2
+    # 10 cm aside a step: 0.1 and 0.3 m until their ends
+    assert walk.sideways == pytest.approx((0.2, 0.2, 0.3))
 
 
 def test_speed_that_errs_both_ways_alike_is_right_on_the_whole():

@@ -123,6 +123,23 @@ def test_every_scene_and_condition_is_shown(tmp_path):
     assert row(seen, "frames dropped", "30 %")[2:] == ["80", "41", "51.2 %", "4"]
 
 
+def test_how_far_robots_come_off_their_way_is_shown(tmp_path):
+    seen = written(records.table(), tmp_path)
+    assert row(seen, "gap hard, 75 cm", "11 cm")[1:] == ["11 cm", "24 cm", "57 cm"]
+    seen = written(records.ood(), tmp_path)
+    assert row(seen, "Pallets with slots of 3 cm", "13 cm")[1:] == ["13 cm", "32 cm", "68 cm"]
+    assert row(written(records.WALK, tmp_path), "flat ground")[1:] == ["14 cm", "26 cm", "38 cm"]
+
+
+def test_how_commands_are_obeyed_is_shown(tmp_path):
+    seen = written(records.COMMANDS, tmp_path)
+    assert "33 of 40told to stand, move less than 5 cm" in seen.text
+    assert "29 of 40told to stand, take no step" in seen.text and "42 cmfurther" in seen.text
+    stand = row(seen, "0.00, 0.00, 0.00")
+    assert stand[1:] == ["0.01, -0.00, 0.02", "0.01, 0.01, 0.02", "1 of 40", "16.0 %, 17.0 %"]
+    assert row(seen, "0.60, 0.00, 0.00")[3] == "40 of 40"
+
+
 def test_the_records_of_one_kind_are_shown(tmp_path):
     walk = written(records.WALK, tmp_path).text
     assert "197 of 200episodes without a fall" in walk and "0.0936 m/s" in walk

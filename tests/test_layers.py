@@ -28,6 +28,8 @@ LAYERS = [
         "limits",
         "ramp",
         "gait",
+        "losses",
+        "sideways",
         "proportion",
         "stall",
         "disturbance",

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import sample
 from sample import ROBOTS, C, on, one
 
-from cref_jax import env, mirror, network
+from cref_jax import config, env, learn, mirror, network, rollout
 
 MODEL_NAMES = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 SIGNS = (1, -1, -1, 1, 1, -1)
@@ -93,3 +94,55 @@ def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
         np.testing.assert_array_equal(feet, real.measures.airborne)
     difference = np.abs(np.asarray(look(world, image))[..., ::-1] - np.asarray(look(world, state)))
     assert np.mean(difference < 0.01) > 0.99  # of the pixels; rounding decides at edges
+
+
+def taught():
+    """Return the world, the learner and the robots of a small run that is taught symmetry."""
+    c = config.override(
+        C,
+        {
+            "run": {"num_envs": 4},
+            "ppo": {"horizon": 4, "minibatches": 2, "mirror_weight": 1.0},
+            "network": {"token": 8, "lstm": 8, "gru": 8, "actor": [8], "critic": [8]},
+        },
+    )
+    world = sample.world().replace(config=c)
+    return world, jax.jit(learn.initial_state)(world)
+
+
+@pytest.fixture(scope="module")
+def symmetric():
+    return taught()
+
+
+def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
+    world, state = symmetric
+    of = mirror.of(world.physics.model, world.config.network)
+    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+    act = jax.jit(lambda nets, r: rollout.act(nets, state.train, r), static_argnums=0)
+    keys = iter(jax.random.split(jax.random.key(5), 9))
+    noise = lambda x: jax.random.uniform(next(keys), x.shape, x.dtype)
+    robots = state.robots
+    image = robots.replace(memory=robots.memory.twin)
+    for fresh in (True, False):
+        seen = robots.observation._replace(proprioception=noise(robots.observation.proprioception))
+        feed = robots.feed.replace(
+            frame=noise(robots.feed.frame), seen=jnp.ones(4, bool), fresh=jnp.array(fresh)
+        )
+        robots = robots.replace(observation=seen, feed=feed)
+        turned = seen._replace(proprioception=of.obs(seen.proprioception))
+        image = image.replace(observation=turned, feed=feed.replace(frame=of.frames(feed.frame)))
+        memory, said = act(nets._replace(mirror=of), robots)
+        alone, expected = act(nets, image)
+        jax.tree.map(np.testing.assert_array_equal, memory.twin, alone)
+        assert not np.allclose(said.mean, expected.mean)
+        robots, image = robots.replace(memory=memory), image.replace(memory=alone)
+
+
+def test_training_remembers_what_the_twin_has_seen(symmetric):
+    world, state = symmetric
+    after, log = learn.chunk(world, state, learn.mesh_of(), 2)
+    assert (log["loss/asymmetry"] > 0.0).all()
+    twin, own = after.robots.memory.twin, after.robots.memory
+    assert not np.allclose(twin.carry.gru, own.carry.gru)
+    assert float(jnp.abs(twin.features.tokens).max()) == 0.0  # dropped after a horizon

@@ -18,7 +18,7 @@ FEW = {name: ood.named(name) for name in ("flagstones", "steel_grate")}
 
 
 def outcome(ending, seconds=9.0, status=Status.OK):
-    return Outcome(ending, seconds, 5.0, 0.5, status)
+    return Outcome(ending, seconds, 5.0, 0.5, status, 0.1, 0.3)
 
 
 def arguments(seed=0):

@@ -10,14 +10,14 @@ import pytest
 from brax.training.agents.ppo.losses import compute_gae
 from jax.test_util import check_grads
 
-from cref_jax import config, gaussian, network, ppo, readout
+from cref_jax import config, gaussian, losses, network, ppo, readout
 
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
 SMALL = config.Network(variant="blind", token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
 FEATURES = 6  # of a blind policy: as many as of a token
 KEY = jax.random.key(0)
-NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
+NETWORKS = losses.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
 
 
 def column(*values):
@@ -28,7 +28,7 @@ def column(*values):
 def initial_params(seed=0):
     carry, no = network.initial_carry(SMALL, 1), jnp.zeros((1, 1), bool)
     key_actor, key_critic = jax.random.split(jax.random.key(seed))
-    params = ppo.Params(
+    params = losses.Params(
         network.Actor(SMALL, J).init(key_actor, carry, jnp.zeros((1, 1, OBS)), no),
         network.Critic(SMALL).init(key_critic, jnp.zeros((1, 1, CRITIC_OBS))),
     )
@@ -136,9 +136,9 @@ def test_surrogate_worked_by_hand():
     # Loss: A = -2: r 1.5 -> min(-3, -2.4) = -3 ; r .5 -> min(-1, -1.6) = -1.6 ; r 1.1 -> -2.2
     ratio = jnp.array([[1.5, 0.5, 1.1, 1.5, 0.5, 1.1]])
     advantage = jnp.array([[2.0, 2.0, 2.0, -2.0, -2.0, -2.0]])
-    out = ppo.surrogate(ratio, advantage, 0.2)
+    out = losses.surrogate(ratio, advantage, 0.2)
     np.testing.assert_allclose(out[0], [-2.4, -1.0, -2.2, 3.0, 1.6, 2.2], rtol=1e-6)
-    slope = jax.grad(lambda r: ppo.surrogate(r, advantage, 0.2).sum())(ratio)
+    slope = jax.grad(lambda r: losses.surrogate(r, advantage, 0.2).sum())(ratio)
     np.testing.assert_allclose(slope[0], [0.0, -2.0, -2.0, 2.0, 0.0, 2.0])
 
 
@@ -146,7 +146,7 @@ def test_value_error_worked_by_hand():
     # old 1, clip .2. V 1.1, target 2: (.9)^2 = .81, inside the clip range
     # V 2, target 2: free 0, held 1.2: .64 ; V 3, target 1: free 4, held 1.2: .04
     value, target = jnp.array([[1.1, 2.0, 3.0]]), jnp.array([[2.0, 2.0, 1.0]])
-    out = ppo.value_error(value, jnp.ones((1, 3)), target, 0.2)
+    out = losses.value_error(value, jnp.ones((1, 3)), target, 0.2)
     np.testing.assert_allclose(out[0], [0.81, 0.64, 4.0], rtol=1e-5)
 
 
@@ -191,7 +191,7 @@ def test_the_loss_worked_by_hand():
     # KL = .01/2 = .005
     # total = -2.199318 + 1*.81 + 1*5 - .005*1.418939 = 3.603588
     one = lambda x: jnp.full((1, 1), x)
-    batch = ppo.Batch(
+    batch = losses.Batch(
         obs=jnp.zeros((1, 1, 1)),
         critic_obs=jnp.zeros((1, 1, 1)),
         velocity=jnp.zeros((1, 1, 3)),
@@ -206,17 +206,18 @@ def test_the_loss_worked_by_hand():
         carry=(),
     )
     said = lambda m: OneStep(m[None, None, None], jnp.zeros(1), jnp.array([[[1.0, 2.0, 0.0]]]))
-    networks = ppo.Networks(
+    networks = losses.Networks(
         lambda m, carry, obs, begins, sight: (carry, said(m)), lambda v, s: one(v)
     )
-    params = ppo.Params(jnp.array(0.1), jnp.array(1.1))
-    total, parts = ppo.loss(params, batch, config.PPO(), networks)
+    params = losses.Params(jnp.array(0.1), jnp.array(1.1))
+    total, parts = losses.loss(params, batch, config.PPO(), networks)
     np.testing.assert_allclose(total, 3.603588, rtol=1e-6)
     expected = {
         "surrogate": -2.199318,
         "value": 0.81,
         "velocity": 5.0,
         "readout": 0.0,
+        "asymmetry": 0.0,
         "entropy": 1.418939,
         "kl": 0.005,
         "clipped": 0.0,
@@ -225,15 +226,67 @@ def test_the_loss_worked_by_hand():
         np.testing.assert_allclose(getattr(parts, name), value, rtol=1e-5, err_msg=name)
 
 
+def mirrored_toy():
+    """An actor that says W o + b, and a mirror that turns over the sign of all things."""
+
+    class Said(NamedTuple):
+        mean: jax.Array
+        log_std: jax.Array
+        velocity: jax.Array
+        feature: None = None
+
+    def actor(p, carry, obs, begins, sight):
+        return carry, Said(obs @ p["w"] + p["b"], jnp.zeros(J), jnp.zeros((*obs.shape[:2], 3)))
+
+    turned = lambda x: -x
+    mirror = losses.Mirror(obs=turned, frames=turned, sight=lambda sight: sight, action=turned)
+    networks = NETWORKS._replace(actor=actor, mirror=mirror)
+    params = {"w": jax.random.normal(KEY, (OBS, J)), "b": jnp.array([0.3, -0.1])}
+    return networks, initial_params()._replace(actor=params)
+
+
+def test_asymmetry_is_what_the_mirrored_policy_does_otherwise():
+    # W o + b - M(W (M o) + b) = W o + b + (-W o + b) = 2 b; the mean of (0.6^2, 0.2^2) is 0.2
+    networks, params = mirrored_toy()
+    batch = judge(some_rollout())
+    batch = batch._replace(twin_obs=-batch.obs, twin=())
+    _, said = networks.actor(params.actor, (), batch.obs, None, None)
+    found = losses.asymmetry(params.actor, batch, said.mean, networks.actor, networks.mirror)
+    np.testing.assert_allclose(found, 0.2, rtol=1e-5)
+    c = dataclasses.replace(C, mirror_weight=3.0)
+    with_it, parts = losses.loss(params, batch, c, networks)
+    without, _ = losses.loss(params, batch, C, networks)
+    np.testing.assert_allclose(with_it - without, 3.0 * 0.2, rtol=1e-4)
+    np.testing.assert_allclose(parts.asymmetry, 0.2, rtol=1e-5)
+
+
+def test_an_update_makes_the_policy_more_symmetric():
+    # nothing to gain anywhere, so that the mirror alone decides: b shrinks and W stays
+    networks, params = mirrored_toy()
+    c = dataclasses.replace(C, mirror_weight=1.0, entropy_weight=0.0, learning_rate=0.01)
+    rollout = some_rollout()._replace(twin=())
+    rollout = rollout._replace(mean=rollout.obs @ params.actor["w"] + params.actor["b"])
+    rollout = rollout._replace(
+        action=rollout.mean, reward=jnp.zeros((T, E)), value=jnp.zeros((T, E))
+    )
+    rollout = rollout._replace(next_value=jnp.zeros((T, E)), log_std=jnp.zeros((T, E, J)))
+    state = ppo.initial_state(params, OBS, CRITIC_OBS, c)
+    after, losses = ppo.update(state, rollout, KEY, c, networks)
+    assert losses.asymmetry[0, 0] == pytest.approx(0.2, rel=1e-4)
+    before, now = params.actor, after.params.actor
+    assert (jnp.abs(now["b"]) < jnp.abs(before["b"])).all()
+    np.testing.assert_allclose(now["w"], before["w"], atol=1e-6)
+
+
 def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():
     batch = judge(some_rollout())
     params = initial_params()
     silent = readout.untaught(FEATURES, 2)
     says = silent._replace(bias=jnp.array([1.0, -2.0]))
     c = dataclasses.replace(C, readout_weight=0.5)
-    without, parts = ppo.loss(params, batch, c, NETWORKS)
+    without, parts = losses.loss(params, batch, c, NETWORKS)
     assert parts.readout == 0.0
-    total, parts = ppo.loss(params._replace(readout=says), batch, c, NETWORKS)
+    total, parts = losses.loss(params._replace(readout=says), batch, c, NETWORKS)
     wanted = np.mean((batch.critic_obs[..., -2:] - np.array([1.0, -2.0])) ** 2)
     np.testing.assert_allclose(parts.readout, wanted, rtol=1e-5)
     np.testing.assert_allclose(total - without, 0.5 * wanted, rtol=1e-4)
@@ -246,7 +299,7 @@ def test_the_readout_teaches_the_actors_features():
 
     def slope(weight):
         c = dataclasses.replace(C, readout_weight=weight)
-        return jax.grad(lambda p: ppo.loss(p, batch, c, NETWORKS)[0])(params).actor["params"]
+        return jax.grad(lambda p: losses.loss(p, batch, c, NETWORKS)[0])(params).actor["params"]
 
     changes = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), slope(1.0), slope(0.0))
     largest = {name: max(jax.tree.leaves(part)) for name, part in changes.items()}
@@ -266,8 +319,8 @@ def test_the_gradient_of_the_loss_agrees_with_finite_differences():
 
         @jax.jit
         def loss(rest, critic):
-            moved = ppo.Params({"params": {**actor, **rest}}, critic)
-            return ppo.loss(moved, batch, C, NETWORKS)[0]
+            moved = losses.Params({"params": {**actor, **rest}}, critic)
+            return losses.loss(moved, batch, C, NETWORKS)[0]
 
         rest = {k: 1.01 * v for k, v in actor.items() if k == "log_std"} | {
             k: v for k, v in actor.items() if k not in ("velocity_estimator", "log_std")

@@ -35,6 +35,7 @@ TABLE_1 = {
     "stumble": -10.0,
 }
 ALTERNATIVES = {  # rows that Table I has not, off by default
+    "foothold_missed": 0.0,
     "foot_contact_quality": 0.0,
     "air_time_variance": 0.0,
     "foot_up_when_standing": 0.0,
@@ -121,6 +122,31 @@ def test_foothold_placement(x2):
     check(x2, "foothold_placement", 2.0, first_contact=[True, True], foothold_distance=[0.0, 0.0])
     # no candidate: nothing, and a number
     check(x2, "foothold_placement", 0.0, first_contact=[True, True])
+
+
+def test_foothold_missed(x2):
+    # 8 cm beside: 1 - exp(-1); on the candidate, or where there is none: nothing
+    feet = {"first_contact": [True, True]}
+    check(x2, "foothold_missed", 1.0 - math.exp(-1.0), foothold_distance=[0.08, 0.0], **feet)
+    check(x2, "foothold_missed", 0.0, **feet)
+    check(x2, "foothold_missed", 0.0, first_contact=[False, True], foothold_distance=[0.08, 0.0])
+
+
+def test_footholds_can_weigh_more_without_paying_for_more_steps(x2):
+    # with weights 2 and -4 a perfect step is worth 2, and 8 cm beside costs three times as much
+    weigh = lambda d, placed, missed: float(
+        placed * reward.foothold_placement(stepped(x2, d), C, x2)
+        + missed * reward.foothold_missed(stepped(x2, d), C, x2)
+    )
+    assert weigh(0.0, 2.0, -4.0) == weigh(0.0, 2.0, 0.0) == 2.0
+    cost = lambda missed: weigh(0.0, 2.0, missed) - weigh(0.08, 2.0, missed)
+    assert cost(-4.0) == pytest.approx(3.0 * cost(0.0))
+
+
+def stepped(x2: robot.Robot, distance: float) -> reward.Snapshot:
+    """Put one foot down so far from its nearest candidate."""
+    down = jnp.array([True, False])
+    return walking(x2)._replace(first_contact=down, foothold_distance=jnp.full(2, distance))
 
 
 def test_foot_contact_quality(x2):

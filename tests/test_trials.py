@@ -181,7 +181,8 @@ def trace(steps, robots=1, progress=0.01, **flags):
         )
     )
     way = progress * np.arange(1, steps + 1)[:, None] * np.ones(robots)
-    return Trace(ending, way.astype(np.float32), np.full((steps, robots), 0.5, np.float32))
+    aside = 0.001 * np.arange(steps)[:, None] * np.ones(robots)
+    return Trace(ending, way.astype(np.float32), np.full((steps, robots), 0.5, np.float32), aside)
 
 
 @pytest.mark.parametrize(
@@ -204,6 +205,8 @@ def test_what_comes_first_decides(flags, progress, ending, seconds):
     assert ENDINGS[found.ending[0]] == ending
     assert found.seconds[0] == pytest.approx(seconds)
     assert found.forward[0] == pytest.approx(0.5)
+    # 1 mm aside a step, and it begins in the middle; the last step's y is that before it
+    assert found.drift[0] == found.aside[0] == pytest.approx(0.001 * (seconds / PERIOD - 1))
 
 
 def test_stairs_are_tried_up_and_down_and_every_lane_in_turn(physics):
@@ -231,9 +234,8 @@ def test_the_worlds_lanes_have_the_sizes_of_the_cells(physics):
 def made(successes, count, speed=0.45, cause="low"):
     ending = np.full(count, ENDINGS.index(cause))
     ending[:successes] = 0
-    return trials.Trials(
-        np.full(count, speed, np.float32), ending, np.ones(count), np.ones(count, np.float32)
-    )
+    one = np.ones(count, np.float32)
+    return trials.Trials(np.full(count, speed, np.float32), ending, one, one, 0.1 * one, 0.3 * one)
 
 
 def outcomes(successes, count, **how):
@@ -256,6 +258,7 @@ def test_a_row_counts_failures_by_way_cause_and_speed():
     assert [(bin["trials"], bin["successes"]) for bin in row["by_speed"]] == [
         (0, 0), (0, 0), (10, 7), (0, 0),
     ]  # fmt: skip
+    assert row["sideways"] == pytest.approx({"drift_m": 0.1, "largest_m": 0.3, "worst_m": 0.3})
     assert row["paper"]["rate"] == 0.9985 and row["paper"]["significant"]
     assert row["paper"]["difference"] == pytest.approx(0.7 - 0.9985)
 

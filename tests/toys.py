@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from cref_jax import config, layers, network, ppo
+from cref_jax import config, layers, losses, network, ppo
 
 
 class Toy(NamedTuple):
@@ -58,10 +58,10 @@ def solve(toy: Toy, c: config.PPO, iterations: int, memory=True, num_envs=64, se
     """Learn the toy by PPO and say how the learnt policy behaves."""
     actor, width = Recaller(memory), toy.observe(jnp.array(0), jnp.array(1.0)).size
     value_net = layers.MLP((32, 1), name="value")
-    networks = ppo.Networks(actor.apply, lambda p, s: value_net.apply(p, s)[..., 0])
+    networks = losses.Networks(actor.apply, lambda p, s: value_net.apply(p, s)[..., 0])
     key_actor, key_critic, key = jax.random.split(jax.random.key(seed), 3)
     no, empty = jnp.zeros((1, 1), bool), lambda n: jnp.zeros((n, actor.hidden))
-    params = ppo.Params(
+    params = losses.Params(
         actor.init(key_actor, empty(1), jnp.zeros((1, 1, width)), no),
         value_net.init(key_critic, jnp.zeros((1, 1, 2))),
     )
