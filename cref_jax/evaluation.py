@@ -13,7 +13,6 @@ from cref_jax import lanes, ppo, rollout, shapes, sideways, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
-from cref_jax.sideways import Sideways
 from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
@@ -32,7 +31,7 @@ class Walk(NamedTuple):
     tracking_error: float  # m/s, of the planar velocity at each step
     airborne: tuple[float, float]  # share of time that the left and the right foot are off ground
     step_seconds: float  # mean time between two touchdowns of one foot
-    sideways: Sideways
+    sideways: dict[str, float]  # m, see sideways.summed
 
     def line(self) -> str:
         """Return the outcome in one line for people."""
@@ -55,7 +54,9 @@ class Crossing(NamedTuple):
     by_cause: dict[str, int]  # of the failures
     seconds: float  # mean time of a success
     speed: float  # m/s forward, mean over the trials
-    sideways: Sideways | None = None  # None for a robot in another simulation
+    sideways: dict[str, float] | None = (
+        None  # m, see sideways.summed; None for a robot in another simulation
+    )
 
     def line(self) -> str:
         """Return the outcome in one line for people."""

@@ -263,9 +263,7 @@ def _sideways(places: Sequence[Record]) -> Html:
     keys = ("drift_m", "largest_m", "worst_m")
     place = lambda of: _called(of) if "title" in of else _name(of) or "flat ground"
     rows = [(place(of), *(f"{100.0 * of['sideways'][k]:.0f} cm" for k in keys)) for of in places]
-    said = (
-        "Drift is |y| at the end less y at the start, y = 0 the middle of the way; means of trials."
-    )
+    said = "Drift is |y| at the end, y = 0 the middle of the way, to which robots are steered."
     return join(paragraph(said), page.table(columns, rows))
 
 

@@ -21,8 +21,8 @@ from PIL import Image
 
 from cref_jax import config, terrain
 from cref_jax.config import ConfigError
-from cref_jax.shapes import KINDS, Range, columns, level_places
-from cref_jax.terrain import Terrain
+from cref_jax.shapes import KINDS, Heights, Range, columns, level_places
+from cref_jax.terrain import Grid, Terrain
 
 MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: within START
 MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
@@ -33,12 +33,11 @@ MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
 class Atlas:
     """All lanes in one grid: rows are the variants of each level, columns are kinds."""
 
-    terrain: Terrain  # the whole grid, in the coordinates of its first tile
+    terrain: Grid
     places: Float[np.ndarray | Array, "rows kinds places 2"]  # m, x and height of level stretches
     # before the last obstacle of each lane; NaN where there are none
     sizes: Float[np.ndarray | Array, "levels kinds"]  # m; m/m for a slope
     kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
-    columns: tuple[int, int] = flax.struct.field(pytree_node=False)  # of the grid, along, across
     is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # each kind: level across
     turns: tuple[int, ...] = flax.struct.field(pytree_node=False)  # kinds that robots get in turn
     variants: int = flax.struct.field(pytree_node=False, default=1)  # of each level of each kind
@@ -51,7 +50,7 @@ class Atlas:
     @property
     def length(self) -> float:
         """Length of a lane, m."""
-        return self.columns[0] * self.terrain.cell
+        return self.terrain.size[0] * self.terrain.cell
 
     @property
     def end(self) -> Float[ArrayLike, ""]:
@@ -66,8 +65,7 @@ class Atlas:
         self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""], variant: Int[ArrayLike, ""] = 0
     ) -> Terrain:
         """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""
-        row = level * self.variants + variant
-        return terrain.tile(self.terrain, self.columns, row, kind)
+        return terrain.tile(self.terrain, level * self.variants + variant, kind)
 
     def level_place(
         self,
@@ -181,31 +179,31 @@ class _MapFile:
 def _atlas(
     c: config.Terrain, numbers: dict[str, _Numbers], sizes: np.ndarray, seeds: list[int]
 ) -> Atlas:
-    """Return the lanes of each kind, a column of tiles, at its sizes [levels, kinds] and seeds."""
-    along, across = columns(c.lane_length, c), columns(c.lane_width, c)
-    _check_columns((along * sizes.shape[0], across * sizes.shape[1]), f"terrain '{c.name}'")
-    heights = np.empty((sizes.shape[0], along, sizes.shape[1], across), np.float32)
+    """Return the lanes of each kind at its sizes [levels, kinds] and seeds."""
+    size = columns(c.lane_length, c), columns(c.lane_width, c)
+    stored, places, is_profile = [], [], []
     for k, (kind, n) in enumerate(numbers.items()):
-        for level, size in enumerate(sizes[:, k]):
-            # of seed, kind and size alone, so that a lane is the same in whatever mix it stands
-            drawn_by = [seeds[level], zlib.crc32(kind.encode()), round(1e4 * size)]
-            rng = np.random.default_rng(drawn_by)
-            heights[level, :, k] = KINDS[kind].heights(c, float(size), n.shape, rng)
-    places = [
-        [level_places(lane[:, across // 2], c.cell) for lane in of_level]
-        for of_level in heights.swapaxes(1, 2)
-    ]
-    grid = heights.reshape(along * sizes.shape[0], across * sizes.shape[1])
-    origin = (0.0, -0.5 * across * c.cell)
+        _check_columns((size[0] * len(seeds), size[1]), f"'{kind}' of terrain '{c.name}'")
+        drawn = [_lane(c, n.shape, kind, float(sizes[row, k]), s) for row, s in enumerate(seeds)]
+        level_across = all((lane == lane[:, :1]).all() for lane in drawn)
+        is_profile.append(level_across)
+        places.append([level_places(lane[:, size[1] // 2], c.cell) for lane in drawn])
+        stored.append([lane[:, :1].copy() if level_across else lane for lane in drawn])
+    origin = (0.0, -0.5 * size[1] * c.cell)
     return Atlas(
-        terrain=terrain.from_heights(grid, c.cell, origin, lane=(along, across)),
-        places=np.array(places, np.float32),
+        terrain=terrain.grid(list(zip(*stored, strict=True)), c.cell, origin, size),
+        places=np.array(places, np.float32).swapaxes(0, 1),
         sizes=sizes,
         kinds=tuple(numbers),
-        columns=(along, across),
-        is_profile=tuple(bool((h == h[..., :1]).all()) for h in np.moveaxis(heights, 2, 0)),
+        is_profile=tuple(is_profile),
         turns=tuple(range(len(numbers))),
     )
+
+
+def _lane(c: config.Terrain, shape: Any, kind: str, size: float, seed: int) -> Heights:
+    """Return one lane, of seed, kind and size alone: it is the same in whatever mix it stands."""
+    rng = np.random.default_rng([seed, zlib.crc32(kind.encode()), round(1e4 * size)])
+    return KINDS[kind].heights(c, size, shape, rng)
 
 
 def _check_lane(c: config.Terrain) -> None:
@@ -348,10 +346,10 @@ def _own_map(path: Path) -> Atlas:
         raise ConfigError(f"{file_path.name}: start {list(file.start)} is not on the map, {size} m")
     heights = (heights - heights[start]) * file.scale
     origin = (MAP_START - file.start[0], -file.start[1])
-    grid = terrain.from_heights(heights.astype(np.float32), file.cell, origin)
+    grid = terrain.grid([[heights.astype(np.float32)]], file.cell, origin, heights.shape)
     is_profile = bool((heights == heights[:, :1]).all())
     nowhere = np.full((1, 1, 1, 2), np.nan, np.float32)
-    return Atlas(grid, nowhere, np.zeros((1, 1)), ("custom",), heights.shape, (is_profile,), (0,))
+    return Atlas(grid, nowhere, np.zeros((1, 1)), ("custom",), (is_profile,), (0,))
 
 
 def _array(path: Path) -> np.ndarray:

@@ -56,7 +56,7 @@ class SceneResult(NamedTuple):
     wilson_high: float
     seconds: float | None  # mean time of a success
     passed: bool
-    sideways: dict[str, float]  # m, see sideways.Sideways
+    sideways: dict[str, float]  # m, see sideways.summed
 
 
 class ConditionResult(NamedTuple):
@@ -129,7 +129,7 @@ def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneRes
         passed=is_passed(outcomes),
         sideways=summed(
             np.array([o.drift for o in outcomes]), np.array([o.aside for o in outcomes])
-        )._asdict(),
+        ),
     )
 
 

@@ -32,9 +32,7 @@ class Landed(NamedTuple):
 
 def along(ground: Terrain) -> Float[np.ndarray, " X"]:
     """Return the heights along the middle of a lane, m."""
-    first, size = np.asarray(ground.first), np.asarray(ground.size)
-    middle = first[1] + size[1] // 2
-    return np.asarray(ground.heights)[first[0] : first[0] + size[0], middle]
+    return ground.heights[:, ground.size[1] // 2]
 
 
 def of_heights(heights: Float[np.ndarray, " X"], cell: float) -> Profile:

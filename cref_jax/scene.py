@@ -85,9 +85,7 @@ def add_checker(
 
 def window(ground: Terrain) -> tuple[Float[np.ndarray, "X Y"], Float[np.ndarray, "2"]]:
     """Return the heights of the columns in the terrain's window, and its outer corner, m."""
-    first, size = np.asarray(ground.first), np.asarray(ground.size)
-    rows, columns = (slice(f, f + s) for f, s in zip(first, size, strict=True))
-    return np.asarray(ground.heights)[rows, columns], np.asarray(ground.origin)
+    return ground.heights, np.asarray(ground.origin)
 
 
 def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) -> Boxes | None:

@@ -181,7 +181,7 @@ def _cell(cell: Cell, outcomes: list[Outcomes]) -> dict[str, Any]:
         "down_failures": int((lost & is_down).sum()) if kind == "stairs" else None,
         "failures": all_trials.failures(),
         "by_speed": _by_speed(all_trials),
-        "sideways": sideways.summed(all_trials.drift, all_trials.aside)._asdict(),
+        "sideways": sideways.summed(all_trials.drift, all_trials.aside),
         "by_policy": by_policy,
         "spread": float(np.std(by_policy, ddof=1)) if len(by_policy) > 1 else None,
         "paper": _beside(rate, cell),

@@ -1,16 +1,18 @@
-"""The ground: one grid of columns that contact, depth, height scan and foothold reward all read.
+"""The ground: columns of boxes that contact, depth, height scan and foothold reward all read.
 
-Column (i, j) of a `Terrain` is a box, filled from minus infinity up to `heights[i, j]`, so a riser
-is truly vertical. All robots share one array of heights. A robot sees a window of it, its lane;
-outside of the window the heights of its border continue. Frames: x along the lane, z up.
+Column (i, j) of a `Terrain` is a box, filled from minus infinity up to its height, so a riser is
+truly vertical. All robots share one array of heights, a `Grid` of lanes. A robot sees a window of
+it, its lane; outside of the window the heights of its border continue, so a lane that is level
+across is stored as one column. Frames: x along the lane, z up.
 """
 
-import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple, no_type_check
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from cref_jax import kernels
@@ -30,66 +32,86 @@ _ABOVE = 1e-5  # m, a second contact lies further than this in front of the firs
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Terrain:
-    """A window of a grid of columns."""
+    """A window of columns."""
 
-    tops: Float[Array, " N"]  # m, of the columns row by row, of each larger size of BLOCKS, bottoms
+    tops: Float[Array, " N"]  # m, of all lanes
+    parts: Int[Array, " P"]  # where in `tops` the window's columns begin, the blocks of each larger
+    # size of BLOCKS, and the bottoms of the largest; row by row
+    across: Int[Array, " B"]  # how many columns, and blocks of each size, are stored across
     origin: Float[Array, " 2"]  # m, outer corner of the window's first column
-    first: Int[Array, " 2"]  # the window's first column
-    size: Int[Array, " 2"]  # columns in the window
     cell: float = flax.struct.field(pytree_node=False)  # m, side of a column
-    shape: tuple[int, int] = flax.struct.field(pytree_node=False)  # X, Y, of the whole grid
-    lane: tuple[int, int] = flax.struct.field(pytree_node=False)  # columns that blocks stay within
+    size: tuple[int, int] = flax.struct.field(pytree_node=False)  # columns along and across
 
     @property
-    def heights(self) -> Float[Array, "X Y"]:
-        """Heights of the whole grid, m."""
-        return self.tops[: self.shape[0] * self.shape[1]].reshape(self.shape)
+    def heights(self) -> Float[np.ndarray, "X Y"]:
+        """Heights of the window's columns, m."""
+        first, across = int(self.parts[0]), int(self.across[0])
+        stored = np.asarray(self.tops)[first : first + self.size[0] * across]
+        return np.broadcast_to(stored.reshape(self.size[0], across), self.size)
+
+
+@no_type_check
+@flax.struct.dataclass
+class Grid:
+    """Lanes of one size, of which each is a `Terrain` in the same coordinates."""
+
+    tops: Float[Array, " N"]
+    parts: Int[Array, "rows kinds P"]
+    across: Int[Array, "rows kinds B"]
+    origin: Float[Array, " 2"]
+    cell: float = flax.struct.field(pytree_node=False)
+    size: tuple[int, int] = flax.struct.field(pytree_node=False)
 
 
 def from_heights(
-    heights: Float[ArrayLike, "X Y"],
-    cell: float,
-    origin: tuple[float, float] = (0.0, 0.0),
-    lane: tuple[int, int] | None = None,
+    heights: Float[ArrayLike, "X Y"], cell: float, origin: tuple[float, float] = (0.0, 0.0)
 ) -> Terrain:
-    """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell.
-
-    The grid consists of whole tiles of `lane` columns, of which each has blocks of its own; if not
-    given it is one tile.
-    """
+    """Return the terrain in which column (i, j) covers origin + [i, i + 1) x [j, j + 1) cell."""
     heights = jnp.asarray(heights, jnp.float32)
-    lane = lane or (heights.shape[0], heights.shape[1])
-    if heights.shape[0] % lane[0] or heights.shape[1] % lane[1]:
-        raise ValueError(f"{heights.shape} columns are not whole tiles of {lane}")
-    larger = [_blocks(heights, lane, side).max((2, 5)) for side in BLOCKS[1:]]
-    bottoms = _blocks(heights, lane, BLOCKS[-1]).min((2, 5))
+    tops, parts, across = _stored(heights, jnp)
     return Terrain(
-        tops=jnp.concatenate([part.reshape(-1) for part in (heights, *larger, bottoms)]),
+        tops=tops,
+        parts=jnp.asarray(parts, jnp.int32),
+        across=jnp.asarray(across, jnp.int32),
         origin=jnp.asarray(origin, jnp.float32),
-        first=jnp.zeros(2, jnp.int32),
-        size=jnp.asarray(heights.shape, jnp.int32),
         cell=float(cell),
-        shape=heights.shape,
-        lane=lane,
+        size=heights.shape,
     )
 
 
-def tile(
-    terrain: Terrain,
+def grid(
+    lanes: Sequence[Sequence[Float[np.ndarray, "_ _"]]],
+    cell: float,
+    origin: tuple[float, float],
     size: tuple[int, int],
-    row: Int[ArrayLike, ""],
-    column: Int[ArrayLike, ""],
-) -> Terrain:
-    """Return tile (row, column) of a grid divided into tiles of `size` columns.
+) -> Grid:
+    """Return rows and kinds of lanes of `size` columns as one grid; each begins at `origin`.
 
-    Every tile has the coordinates of tile (0, 0), so positions stay small and float32 stays exact.
-    The heights are shared, not copied: under vmap over row and column they stay without that axis.
+    A lane of one column across is level across.
     """
-    if size != terrain.lane:
-        raise ValueError(f"the grid is divided into tiles of {terrain.lane} columns, not {size}")
-    size_ij = jnp.asarray(size, jnp.int32)
-    place = jnp.stack([jnp.asarray(row, jnp.int32), jnp.asarray(column, jnp.int32)])
-    return dataclasses.replace(terrain, first=terrain.first + place * size_ij, size=size_ij)
+    stored = [[_stored(lane, np) for lane in row] for row in lanes]
+    flat = [part for row in stored for part in row]
+    begins = np.cumsum([0, *(tops.size for tops, _, _ in flat[:-1])])
+    shape = (len(lanes), len(lanes[0]), -1)
+    parts = np.array([parts + begin for (_, parts, _), begin in zip(flat, begins, strict=True)])
+    return Grid(
+        tops=jnp.asarray(np.concatenate([tops for tops, _, _ in flat])),
+        parts=jnp.asarray(parts.reshape(shape), jnp.int32),
+        across=jnp.asarray(np.array([across for _, _, across in flat]).reshape(shape), jnp.int32),
+        origin=jnp.asarray(origin, jnp.float32),
+        cell=float(cell),
+        size=size,
+    )
+
+
+def tile(grid: Grid, row: Int[ArrayLike, ""], kind: Int[ArrayLike, ""]) -> Terrain:
+    """Return one lane of a grid.
+
+    Every lane has the same coordinates, so positions stay small and float32 stays exact. The
+    heights are shared, not copied: under vmap over row and kind they stay without that axis.
+    """
+    parts, across = grid.parts[row, kind], grid.across[row, kind]
+    return Terrain(grid.tops, parts, across, grid.origin, grid.cell, grid.size)
 
 
 def height_at(terrain: Terrain, xy: Float[ArrayLike, "... 2"]) -> Float[Array, "..."]:
@@ -168,14 +190,12 @@ def block_bottom(terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"]) -> 
 
 
 class _Place(NamedTuple):
-    """Where a point is among the columns of the whole grid, as scalars."""
+    """Where a point is among the columns of the window, as scalars."""
 
     i: Int[Array, ""]  # its column, which may be outside of the window
     j: Int[Array, ""]
-    first_i: Int[Array, ""]  # of the window
-    last_i: Int[Array, ""]
-    first_j: Int[Array, ""]
-    last_j: Int[Array, ""]
+    first: Int[Array, ""]  # column of the window, in `tops`
+    across: Int[Array, ""]  # columns that are stored across
     east: Float[Array, ""]  # m, from its column's corner, never quite on an edge
     north: Float[Array, ""]
 
@@ -205,14 +225,11 @@ def _place(terrain: Terrain, x: Float[Array, ""], y: Float[Array, ""]) -> _Place
     i, j = i.astype(jnp.int32), j.astype(jnp.int32)
     # one number a point, though it is the same for all points of a robot: read in step with i and j
     each = lambda of_window: of_window + jnp.zeros_like(i)
-    first, last = terrain.first, terrain.first + terrain.size - 1
     return _Place(
-        i=first[0] + i,
-        j=first[1] + j,
-        first_i=each(first[0]),
-        last_i=each(last[0]),
-        first_j=each(first[1]),
-        last_j=each(last[1]),
+        i=i,
+        j=j,
+        first=each(terrain.parts[0]),
+        across=each(terrain.across[0]),
         east=inside(u),
         north=inside(v),
     )
@@ -220,9 +237,9 @@ def _place(terrain: Terrain, x: Float[Array, ""], y: Float[Array, ""]) -> _Place
 
 def _column(terrain: Terrain, place: _Place, a: int, b: int) -> Int[Array, ""]:
     """Return which column is `a` and `b` further, or the nearest one inside of the window."""
-    i = jnp.clip(place.i + a, place.first_i, place.last_i)
-    j = jnp.clip(place.j + b, place.first_j, place.last_j)
-    return i * terrain.shape[1] + j
+    i = jnp.clip(place.i + a, 0, terrain.size[0] - 1)
+    j = jnp.clip(place.j + b, 0, place.across - 1)
+    return place.first + i * place.across + j
 
 
 @kernels.apart
@@ -232,9 +249,9 @@ def _column_under(
     """Return which column is under each point, or the nearest one inside of the window."""
     i = jnp.floor((x - terrain.origin[0]) * (1.0 / terrain.cell)).astype(jnp.int32)
     j = jnp.floor((y - terrain.origin[1]) * (1.0 / terrain.cell)).astype(jnp.int32)
-    i = terrain.first[0] + jnp.clip(i, 0, terrain.size[0] - 1)
-    j = terrain.first[1] + jnp.clip(j, 0, terrain.size[1] - 1)
-    return i * terrain.shape[1] + j
+    i = jnp.clip(i, 0, terrain.size[0] - 1)
+    j = jnp.clip(j, 0, terrain.across[0] - 1)
+    return terrain.parts[0] + i * terrain.across[0] + j
 
 
 @kernels.apart
@@ -272,32 +289,31 @@ def _block(
     terrain: Terrain, i: Int[Array, "*n"], j: Int[Array, "*n"], level: int, part: int
 ) -> Float[Array, "*n"]:
     """Return what a part of `tops` holds of the block around a column."""
-    counts = [_block_counts(terrain.lane, side) for side in (*BLOCKS, BLOCKS[-1])]
-    lanes = [whole // n for whole, n in zip(terrain.shape, terrain.lane, strict=True)]
-    start = lanes[0] * lanes[1] * sum(rows * across for rows, across in counts[:part])
-    rows, across = counts[level]
-    row, column = terrain.first // jnp.asarray(terrain.lane, jnp.int32)
     shift = BLOCKS[level].bit_length() - 1
-    i = row * rows + (jnp.clip(i, 0, terrain.size[0] - 1) >> shift)
-    j = column * across + (jnp.clip(j, 0, terrain.size[1] - 1) >> shift)
-    index = start + i * (lanes[1] * across) + j
+    i = jnp.clip(i, 0, terrain.size[0] - 1) >> shift
+    j = jnp.clip(j, 0, terrain.across[0] - 1) >> shift
+    index = terrain.parts[part] + i * terrain.across[level] + j
     # unsigned: an index that may be negative would be looked at once more
     return terrain.tops.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds")
 
 
-def _blocks(heights: Float[Array, "X Y"], lane: tuple[int, int], side: int) -> Array:
-    """Return the heights as [lanes, blocks, side, lanes, blocks, side]; a lane's border goes on."""
-    x, y = (whole // n for whole, n in zip(heights.shape, lane, strict=True))
-    rows, across = _block_counts(lane, side)
-    more_x, more_y = rows * side - lane[0], across * side - lane[1]
-    lanes = heights.reshape(x, lane[0], y, lane[1])
-    lanes = jnp.pad(lanes, [(0, 0), (0, more_x), (0, 0), (0, more_y)], mode="edge")
-    return lanes.reshape(x, rows, side, y, across, side)
+def _stored(
+    heights: Float[ArrayLike, "X Y"], xp: Any
+) -> tuple[Float[ArrayLike, " n"], Int[np.ndarray, " P"], Int[np.ndarray, " B"]]:
+    """Return what `tops` holds of a lane, where its parts begin, and blocks across of each size."""
+    larger = [_blocks(heights, side, xp) for side in BLOCKS[1:]]
+    parts = [heights, *(blocks.max((1, 3)) for blocks in larger), larger[-1].min((1, 3))]
+    begins = np.cumsum([0, *(part.size for part in parts[:-1])])
+    across = np.array([part.shape[1] for part in parts[:-1]])
+    return xp.concatenate([part.reshape(-1) for part in parts]), begins, across
 
 
-def _block_counts(lane: tuple[int, int], side: int) -> tuple[int, int]:
-    """Return how many blocks of a side a lane has along and across."""
-    return -(-lane[0] // side), -(-lane[1] // side)
+def _blocks(heights: Float[ArrayLike, "X Y"], side: int, xp: Any) -> Any:
+    """Return the heights as [blocks, side, blocks, side]; the border goes on."""
+    counts = [-(-n // side) for n in heights.shape]
+    more = [(0, count * side - n) for count, n in zip(counts, heights.shape, strict=True)]
+    padded = xp.pad(heights, more, mode="edge")
+    return padded.reshape(counts[0], side, counts[1], side)
 
 
 def _nearest(offsets: list[_Offset]) -> _Offset:

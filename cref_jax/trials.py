@@ -51,7 +51,7 @@ class Trials(NamedTuple):
     ending: Int[np.ndarray, " N"]  # index into ENDINGS
     seconds: Float[np.ndarray, " N"]
     forward: Float[np.ndarray, " N"]  # m/s, mean speed in the body frame
-    drift: Float[np.ndarray, " N"]  # m, across the lane from the start to the end, either way
+    drift: Float[np.ndarray, " N"]  # m, distance from the lane's middle at the end
     aside: Float[np.ndarray, " N"]  # m, the largest distance from the lane's middle
 
     @property

@@ -367,18 +367,17 @@ def test_every_tile_looks_as_if_it_were_alone():
     rotation = np.stack([turn(rng.uniform(-2, 2), 0.9) for _ in level]).astype(np.float32)
     look = lambda level, kind, p, r: render(atlas.tile(level, kind), p, r, jnp.asarray(NONE))
     images = jax.jit(jax.vmap(look))(level, kind, position, rotation)
-    across = atlas.columns[1]
+    across = atlas.terrain.size[1]
     for n in range(2 * kinds):
-        rows = np.s_[level[n] * 600 : level[n] * 600 + 600]
-        cut = np.asarray(atlas.terrain.heights)[rows, kind[n] * across : (kind[n] + 1) * across]
+        cut = atlas.tile(level[n], kind[n]).heights
         alone = terrain.from_heights(cut, c.cell, (0.0, -0.5 * across * c.cell))
         np.testing.assert_allclose(images[n], see(alone, position[n], rotation[n]), atol=1e-5)
 
 
 def test_cameras_on_different_tiles_share_one_grid():
-    whole = terrain.from_heights(np.zeros((12, 10)), 0.02, lane=(6, 5))
+    whole = terrain.grid(2 * [[np.zeros((6, 5), np.float32)]], 0.02, (0.0, 0.0), (6, 5))
     look = lambda row, p: depth.render(
-        terrain.tile(whole, (6, 5), row, 0), p, jnp.eye(3), jnp.asarray(NONE), CAMERA
+        terrain.tile(whole, row, 0), p, jnp.eye(3), jnp.asarray(NONE), CAMERA
     )
     program = str(jax.make_jaxpr(jax.vmap(look))(jnp.arange(2), jnp.zeros((2, 3))))
     assert f"f32[{whole.tops.size}]" in program

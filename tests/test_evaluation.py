@@ -49,7 +49,7 @@ def test_what_comes_after_a_fall_does_not_count():
     walk = _judged(ending(2), seen._replace(forward_error=error), Config())
     assert walk.speed_error == pytest.approx(0.3)  # (0.2 + 0.4) / 2
     # 10 cm aside a step: 0.1 and 0.3 m until their ends
-    assert walk.sideways == pytest.approx((0.2, 0.2, 0.3))
+    assert walk.sideways == pytest.approx({"drift_m": 0.2, "largest_m": 0.2, "worst_m": 0.3})
 
 
 def test_speed_that_errs_both_ways_alike_is_right_on_the_whole():

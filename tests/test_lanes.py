@@ -1,6 +1,7 @@
 """The lanes: what lies in them, in metres, and what is said about a file that cannot be used."""
 
 import dataclasses
+import itertools
 import re
 
 import jax
@@ -32,9 +33,7 @@ def mixed():
 
 def profile(atlas, level=0, kind=0):
     """Return the heights along the middle of a lane, f64[X]."""
-    row, across = level * atlas.columns[0], atlas.columns[1]
-    middle = kind * across + across // 2
-    return np.asarray(atlas.terrain.heights)[row : row + atlas.columns[0], middle].astype(float)
+    return atlas.tile(level, kind).heights[:, atlas.terrain.size[1] // 2].astype(float)
 
 
 def runs(heights):
@@ -50,8 +49,7 @@ def single(kind, size, **changes):
 def test_mixed_holds_every_kind_once(mixed):
     assert mixed.kinds == tuple(TRAIN)
     assert mixed.levels == 10
-    assert mixed.columns == (600, 200)
-    assert mixed.terrain.heights.shape == (6000, 1400)
+    assert mixed.terrain.size == mixed.tile(9, 6).heights.shape == (600, 200)
     assert mixed.length == pytest.approx(12.0)
 
 
@@ -85,9 +83,18 @@ def test_sizes_run_evenly_from_the_lowest_to_the_highest_of_training(mixed):
 
 
 def test_every_lane_starts_and_ends_level_at_zero(mixed):
-    heights = np.asarray(mixed.terrain.heights).reshape(10, 600, 7, 200)
-    np.testing.assert_array_equal(heights[:, :75], 0.0)
-    np.testing.assert_array_equal(heights[:, -50:], 0.0)
+    for level, kind in itertools.product(range(10), range(7)):
+        heights = mixed.tile(level, kind).heights
+        np.testing.assert_array_equal(heights[:75], 0.0)
+        np.testing.assert_array_equal(heights[-50:], 0.0)
+
+
+def test_a_lane_that_is_level_across_is_stored_as_one_column(mixed):
+    # 60 of 70 lanes: 600 columns and their blocks of 4, 16 and 64, and the bottoms of the last
+    profile_lane, rough = 600 + 150 + 38 + 10 + 10, mixed.is_profile.index(False)
+    blocks = [-(-600 // side) * -(-200 // side) for side in terrain.BLOCKS]
+    assert mixed.is_profile.count(False) == 1 and mixed.kinds[rough] == "rough"
+    assert mixed.terrain.tops.size == 60 * profile_lane + 10 * (sum(blocks) + blocks[-1])
 
 
 def test_a_tile_has_its_start_at_x_zero_and_its_middle_at_y_zero(mixed):
@@ -216,7 +223,7 @@ def test_a_slope_has_the_gradient_asked_for_up_and_down():
 
 def test_rough_ground_spans_the_height_asked_for_in_gentle_steps():
     atlas = lanes.single(config.Terrain(), "rough", 0.06)
-    heights = np.asarray(atlas.terrain.heights)
+    heights = atlas.tile(0, 0).heights
     assert np.ptp(heights) == pytest.approx(0.06, abs=1e-6)
     assert abs(np.diff(heights, axis=0)).max() < 0.01
 
@@ -261,7 +268,7 @@ def write_map(folder, heights, settings="cell = 0.1\nstart = [0.55, 0.25]\n"):
 def test_a_height_map_becomes_one_lane_that_starts_at_z_zero(tmp_path):
     heights = 500.0 + np.arange(60.0).reshape(10, 6) / 100.0
     atlas = lanes.build(write_map(tmp_path, heights))
-    assert (atlas.kinds, atlas.levels, atlas.columns) == (("custom",), 1, (10, 6))
+    assert (atlas.kinds, atlas.levels, atlas.terrain.size) == (("custom",), 1, (10, 6))
     # the start lies in column (5, 2); one metre of heights a row of 6 columns apart is 6 cm
     start = jnp.array([lanes.MAP_START, 0.0])
     found = terrain.height_at(atlas.tile(0, 0), start + jnp.array([[0.0, 0.0], [0.1, 0.0]]))
@@ -275,7 +282,7 @@ def test_a_picture_is_seen_from_above(tmp_path, bits):
     (tmp_path / "hill.toml").write_text("cell = 0.1\nscale = 0.01\nstart = [0.05, 0.05]\n")
     atlas = lanes.build(config.Terrain(name=str(tmp_path / "hill.png")))
     expected = [[0.0, 0.3], [0.1, 0.4], [0.2, 0.5]]
-    np.testing.assert_allclose(atlas.terrain.heights, expected, atol=1e-6)
+    np.testing.assert_allclose(atlas.tile(0, 0).heights, expected, atol=1e-6)
     here = terrain.height_at(atlas.tile(0, 0), jnp.array([lanes.MAP_START, 0.1]))
     np.testing.assert_allclose(here, 0.3, atol=1e-6)
 

@@ -203,23 +203,47 @@ def test_a_point_that_has_blown_up_reads_no_memory_outside_of_the_grid(p):
 def test_a_tile_does_not_see_its_neighbours():
     rng = np.random.default_rng(0)
     grid = rng.uniform(-0.03, 0.03, (4 * SHAPE[0], 3 * SHAPE[1])).astype(np.float32)
-    whole = terrain.from_heights(grid, CELL, ORIGIN, lane=SHAPE)
+    cut = lambda row, column: grid[row * 6 : row * 6 + 6, column * 5 : column * 5 + 5]
+    lanes = [[cut(row, column) for column in range(3)] for row in range(4)]
+    whole = terrain.grid(lanes, CELL, ORIGIN, SHAPE)
     p = rng.uniform([-0.11, 0.24, -0.02], [0.13, 0.46, 0.04], (300, 3)).astype(np.float32)
-    on_tile = jax.jit(lambda r, c, p: terrain.closest_point(terrain.tile(whole, SHAPE, r, c), p))
+    on_tile = jax.jit(lambda r, c, p: terrain.closest_point(terrain.tile(whole, r, c), p))
     for row, column in [(0, 0), (2, 1), (3, 2)]:
-        cut = np.s_[row * 6 : row * 6 + 6, column * 5 : column * 5 + 5]
-        expected = jax.vmap(lambda q, cut=cut: closest(grid[cut], q))(p)
+        expected = jax.vmap(lambda q, lane=lanes[row][column]: closest(lane, q))(p)
         found = jax.vmap(on_tile, (None, None, 0))(row, column, p)
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-7)
 
 
+def test_one_column_across_is_the_same_ground_as_all_of_them():
+    # heights, contact planes, blocks and depth's tops beside one another, also outside of the lane
+    rng = np.random.default_rng(3)
+    profile = rng.uniform(-0.03, 0.03, (70, 1)).astype(np.float32)
+    full = terrain.from_heights(np.repeat(profile, 5, axis=1), CELL, ORIGIN)
+    thin = terrain.tile(terrain.grid([[profile]], CELL, ORIGIN, (70, 5)), 0, 0)
+    np.testing.assert_array_equal(thin.heights, full.heights)
+    low, high = np.array([-0.2, 0.2, -0.02]), np.array([1.6, 0.5, 0.04])
+    p = jnp.asarray(rng.uniform(low, high, (400, 3)), jnp.float32)
+    each = lambda f: lambda ground: jax.jit(jax.vmap(f, in_axes=(None, 0)))(ground, p)
+    for ask in (
+        each(lambda ground, q: terrain.contact_planes(ground, q, 2)),
+        each(lambda ground, q: terrain.height_at(ground, q[:2])),
+    ):
+        jax.tree.map(np.testing.assert_array_equal, ask(thin), ask(full))
+    i, j = map(jnp.asarray, np.meshgrid(np.arange(-3, 80), np.arange(-3, 9), indexing="ij"))
+    for level in range(len(terrain.BLOCKS)):
+        a, b = (terrain.block_top(ground, i, j, level) for ground in (thin, full))
+        np.testing.assert_array_equal(a, b)
+    bottoms = (terrain.block_bottom(ground, i, j) for ground in (thin, full))
+    np.testing.assert_array_equal(*bottoms)
+
+
 def test_robots_on_different_tiles_share_one_grid():
-    whole = terrain.from_heights(np.zeros((12, 10)), CELL, lane=(6, 5))
-    tiled = lambda r, p: terrain.closest_point(terrain.tile(whole, (6, 5), r, 0), p)
+    whole = terrain.grid(2 * [[np.zeros((6, 5), np.float32)]], CELL, ORIGIN, (6, 5))
+    tiled = lambda r, p: terrain.closest_point(terrain.tile(whole, r, 0), p)
     program = str(jax.make_jaxpr(jax.vmap(tiled))(jnp.arange(2), jnp.zeros((2, 3))))
     assert f"f32[{whole.tops.size}]" in program
-    assert f"f32[2,{whole.tops.size}]" not in program and "f32[2,12,10]" not in program
+    assert f"f32[2,{whole.tops.size}]" not in program
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (8, 32), (50, 77)])
@@ -242,7 +266,8 @@ def test_a_block_is_as_high_as_its_highest_column(shape):
 
 def test_a_tiles_blocks_hold_its_own_columns_and_no_others():
     heights = np.arange(60 * 60, dtype=np.float32).reshape(60, 60)
-    ground = terrain.tile(terrain.from_heights(heights, CELL, lane=(20, 20)), (20, 20), 1, 2)
+    lanes = [[heights[r : r + 20, c : c + 20] for c in (0, 20, 40)] for r in (0, 20, 40)]
+    ground = terrain.tile(terrain.grid(lanes, CELL, (0.0, 0.0), (20, 20)), 1, 2)
     read = lambda level, i, j: float(terrain.block_top(ground, jnp.int32(i), jnp.int32(j), level))
     # column (5, 2) of the tile is (25, 42) of the grid; in the tile's blocks from (4, 0) and (0, 0)
     assert read(0, 5, 2) == 25 * 60 + 42
@@ -252,14 +277,6 @@ def test_a_tiles_blocks_hold_its_own_columns_and_no_others():
     assert read(2, 18, 2) == 39 * 60 + 55  # and so does one of 16 that begins at 16
     assert float(terrain.block_bottom(ground, jnp.int32(5), jnp.int32(2))) == 20 * 60 + 40
     assert read(0, -50, 99) == 20 * 60 + 59  # outside of the tile its border goes on
-
-
-def test_a_grid_is_cut_into_the_tiles_that_it_was_made_of():
-    whole = terrain.from_heights(np.zeros((12, 10)), CELL, lane=(6, 5))
-    with pytest.raises(ValueError, match=r"tiles of \(6, 5\) columns, not \(4, 5\)"):
-        terrain.tile(whole, (4, 5), 0, 0)
-    with pytest.raises(ValueError, match=r"\(12, 10\) columns are not whole tiles of \(5, 5\)"):
-        terrain.from_heights(np.zeros((12, 10)), CELL, lane=(5, 5))
 
 
 def test_a_sphere_has_one_or_two_planes():
