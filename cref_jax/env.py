@@ -66,7 +66,7 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     clean = observation.motion(state.body.qpos, state.body.qvel, state.action.size)
     sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
     if c.randomisation.enabled:
-        sensed = observation.with_noise(sensed, c.randomisation, state.spread, key)
+        sensed = observation.with_noise(sensed, c.randomisation, state.spread.noise, key)
     see = lambda m: observation.proprioception(
         m, state.command, jnp.asarray(robot.nominal_pose), state.action
     )

@@ -20,6 +20,24 @@ from cref_jax.physics import Body
 from cref_jax.world import World
 
 
+class Spread(NamedTuple):
+    """What share of its ranges each part of the randomisation has, 0 to 1."""
+
+    friction: Float[ArrayLike, ""]
+    mass: Float[ArrayLike, ""]  # of the trunk, and where its centre is
+    gains: Float[ArrayLike, ""]
+    offsets: Float[ArrayLike, ""]  # of encoders
+    delay: Float[ArrayLike, ""]
+    noise: Float[ArrayLike, ""]
+    pushes: Float[ArrayLike, ""]
+    camera: Float[ArrayLike, ""]  # how it is mounted
+
+
+def evenly(share: Float[ArrayLike, "*n"]) -> Spread:
+    """Return the same share of every part."""
+    return Spread(*[jnp.asarray(share, jnp.float32)] * len(Spread._fields))
+
+
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class EnvState:
@@ -27,7 +45,7 @@ class EnvState:
 
     key: PRNGKeyArray
     body: Body
-    spread: Float[Array, ""]  # share of the randomisation's ranges
+    spread: Spread
     dynamics: Dynamics
     joint_offset: Float[Array, " J"]  # rad, encoder zero
     delay: Int[Array, ""]  # substeps until a new target arrives
@@ -83,13 +101,13 @@ def reset(
     key: PRNGKeyArray,
     kind: Int[Array, ""],
     level: Int[Array, ""],
-    spread: Float[ArrayLike, ""] = 1.0,
+    spread: Spread | None = None,
 ) -> EnvState:
-    """Return a robot on a lane of that kind and level, with a share of the randomisation."""
+    """Return a robot on a lane of that kind and level; the whole randomisation without a spread."""
     c = world.config
     keys = jax.random.split(key, 8)
     joints = len(world.physics.robot.joint_names)
-    spread = jnp.asarray(spread, jnp.float32)
+    spread = evenly(1.0) if spread is None else spread
     variant = jax.random.randint(keys[7], (), 0, world.lanes.variants)
     body = _placed(world, keys[0], kind, level, variant)
     command, is_steered = _drawn_command(world, keys[3], kind)
@@ -121,8 +139,8 @@ def reset(
         support_z=body.qpos[2] - c.reward.base_height_target,
         candidates=foothold.none(c.foothold),
         foothold_distance=jnp.ones(2),
-        camera_pitch=spread * pitch,
-        camera_shift=spread * shift,
+        camera_pitch=spread.camera * pitch,
+        camera_shift=spread.camera * shift,
         step=jnp.zeros((), jnp.int32),
     )
 
@@ -163,7 +181,7 @@ def pushed(world: World, state: EnvState, draws: Draws) -> EnvState:
     if not world.config.randomisation.enabled:
         return state
     due = state.push_left <= 0
-    qvel = state.body.qvel.at[:2].add(jnp.where(due, state.spread * draws.shove, 0.0))
+    qvel = state.body.qvel.at[:2].add(jnp.where(due, state.spread.pushes * draws.shove, 0.0))
     return state.replace(
         body=state.body._replace(qvel=qvel),
         push_left=jnp.where(due, draws.push_left, state.push_left - 1),
@@ -306,32 +324,29 @@ def _placed(
 
 
 def _drawn_dynamics(
-    world: World, key: PRNGKeyArray, spread: Float[Array, ""]
+    world: World, key: PRNGKeyArray, spread: Spread
 ) -> tuple[Dynamics, Float[Array, " J"], Int[Array, ""]]:
-    """Draw the robot's dynamics, its encoder offsets and its action delay in substeps.
-
-    `spread` is the share of all ranges that is drawn from.
-    """
+    """Draw the robot's dynamics, its encoder offsets and its action delay in substeps."""
     c, nominal = world.config.randomisation, world.physics.nominal_dynamics()
     if not c.enabled:
         return nominal, jnp.zeros_like(nominal.kp), jnp.zeros((), jnp.int32)
     keys = jax.random.split(key, 7)
     draw = lambda k, shape, low, high: jax.random.uniform(k, shape, minval=low, maxval=high)
-    within = lambda middle, drawn: middle + spread * (drawn - middle)
+    within = lambda middle, share, drawn: middle + share * (drawn - middle)
     joints = nominal.kp.shape
     dynamics = Dynamics(
-        friction=within(nominal.friction, draw(keys[0], (), *c.friction)),
-        payload=spread * draw(keys[1], (), -c.trunk_mass, c.trunk_mass),
-        com_shift=spread * draw(keys[2], (3,), -c.trunk_com, c.trunk_com),
-        kp=nominal.kp * within(1.0, draw(keys[3], joints, *c.gains)),
-        kd=nominal.kd * within(1.0, draw(keys[4], joints, *c.gains)),
+        friction=within(nominal.friction, spread.friction, draw(keys[0], (), *c.friction)),
+        payload=spread.mass * draw(keys[1], (), -c.trunk_mass, c.trunk_mass),
+        com_shift=spread.mass * draw(keys[2], (3,), -c.trunk_com, c.trunk_com),
+        kp=nominal.kp * within(1.0, spread.gains, draw(keys[3], joints, *c.gains)),
+        kd=nominal.kd * within(1.0, spread.gains, draw(keys[4], joints, *c.gains)),
     )
     most = round(c.action_delay / world.config.physics.timestep)
     delay = jax.random.randint(keys[6], (), 0, most + 1)
     return (
         dynamics,
-        spread * draw(keys[5], joints, -c.joint_offset, c.joint_offset),
-        jnp.round(spread * delay).astype(jnp.int32),
+        spread.offsets * draw(keys[5], joints, -c.joint_offset, c.joint_offset),
+        jnp.round(spread.delay * delay).astype(jnp.int32),
     )
 
 

@@ -27,6 +27,7 @@ from cref_jax import (
     ood_verdict,
     paper,
     processes,
+    robustness,
     runs,
     table,
 )
@@ -34,7 +35,7 @@ from cref_jax.config import ConfigError
 from cref_jax.physics import EngineName
 from cref_jax.world import World
 
-Suite = Literal["table", "ood", "walk", "cross", "commands"]
+Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
 
 
@@ -48,7 +49,9 @@ class Options:
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
     suite: Suite = "table"
-    """table: the twelve cells of Table II and the failures of Table III; ood: twenty scenes in
+    """table: the twelve cells of Table II and the failures of Table III; robust: the same with
+    masses, friction, motors, delays, sensors, pushes and the camera's mount randomised, and with
+    each of these alone; ood: twenty scenes in
     MuJoCo C that nobody was trained on, by the numpy runtime; cross: trials on lanes with obstacles
     of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; commands: to stand, walk
     at each speed, go aside, turn and stop on flat ground"""
@@ -94,7 +97,8 @@ def main(arguments: list[str] | None = None) -> None:
             return
         started = time.monotonic()
         suites = {
-            "table": _table, "ood": _ood, "cross": _cross, "walk": _walk, "commands": _commands,
+            "table": _table, "robust": _robust, "ood": _ood, "cross": _cross, "walk": _walk,
+            "commands": _commands,
         }  # fmt: skip
         found = suites[options.suite](subjects, options)
         record = {"suite": options.suite, "seed": options.seed, **_origin(subjects)}
@@ -122,7 +126,7 @@ def _sources(options: Options) -> list[Path]:
 
 def _subject(source: Path, options: Options) -> Subject:
     # trials are shared out among the devices, of which a CPU has one a core
-    in_trials = options.suite in ("table", "cross")
+    in_trials = options.suite in ("table", "robust", "cross")
     threads = max(processes.cores() // jax.device_count(), 1) if in_trials else 0
     world = runs.world_of(exported.read_config(source), options.engine, threads)
     return Subject(source, exported.load(source, world), world)
@@ -148,6 +152,21 @@ def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
     console.print("* beyond chance: 0 is not in the 95 % interval of the difference")
     console.print(table.failures(rows), highlight=False)
     return {"rule": table.RULE, "cells": rows, "overall": whole}
+
+
+def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
+    """Judge with everything randomised, and with each part alone."""
+    console, count, policy = Console(), _count(options), subjects[0].policy
+    w = robustness.world(policy.config, subjects[0].world.physics)
+    with _progress(console, len(robustness.rows()) * count) as ended:
+        found = robustness.judge(w, policy.train, count, options.seed, ended)
+    console.print(robustness.text(found))
+    console.print(robustness.alone(found))
+    whole = [row for row in found if row["part"] == robustness.EVERYTHING]
+    parts = [row for row in found if row["part"] != robustness.EVERYTHING]
+    return {
+        "rule": table.RULE, "cells": whole, "overall": robustness.overall(found), "parts": parts,
+    }  # fmt: skip
 
 
 def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cref_jax import outcomes, page, shapes
+from cref_jax import evaluation_tables, outcomes, page, shapes
 from cref_jax.config import ConfigError
 from cref_jax.outcomes import Failures, Line, Share, called
 from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
@@ -22,6 +22,7 @@ TITLES = {
     "ood": "Success on scenes that were never trained on",
     "walk": "Walking on flat ground",
     "cross": "Crossing obstacles",
+    "robust": "Success with everything randomised",
     "commands": "Doing what it is told, on flat ground",
 }
 PLAIN = {  # of the suites walk and cross: name in the record: words, and unit
@@ -94,9 +95,13 @@ def _sections(record: Record) -> Iterator[Section]:
         yield Section("Scenes", _scenes(record["scenes"]))
     places = [of for of in (*cells, *(record.get("scenes") or [])) if of.get("sideways")]
     if places or record.get("sideways"):
-        yield Section("Across the way", _sideways(places or [record]))
+        rows = [(_place(of), of["sideways"]) for of in places or [record]]
+        yield Section("Across the way", evaluation_tables.sideways(rows))
+    if record.get("parts"):
+        rates = [(row["part"], _name(row), row["rate"]) for row in record["parts"]]
+        yield Section("Each part alone", evaluation_tables.parts(rates))
     if record.get("commands"):
-        yield Section("Commands", _commands(record["commands"]))
+        yield Section("Commands", evaluation_tables.commands(record["commands"]))
     if record.get("conditions"):
         yield Section("Conditions", _conditions(record["conditions"]))
     plain = _plain(record)
@@ -256,36 +261,6 @@ def _conditions(conditions: Sequence[Record]) -> Html:
     return page.table(columns, rows)
 
 
-def _sideways(places: Sequence[Record]) -> Html:
-    """Return how far robots drift, and how near to the way's side they come, cm."""
-    columns = [Column("where")]
-    columns += [Column(n, True) for n in ("drift", "largest |y|, mean", "largest |y| of all")]
-    keys = ("drift_m", "largest_m", "worst_m")
-    place = lambda of: _called(of) if "title" in of else _name(of) or "flat ground"
-    rows = [(place(of), *(f"{100.0 * of['sideways'][k]:.0f} cm" for k in keys)) for of in places]
-    said = "Drift is |y| at the end, y = 0 the middle of the way, to which robots are steered."
-    return join(paragraph(said), page.table(columns, rows))
-
-
-def _commands(rows: Sequence[Record]) -> Html:
-    """Return how each command was obeyed."""
-    columns = [Column("told: forward, left m/s, turn rad/s")]
-    columns += [Column(n, True) for n in ("does", "error", "fell", "feet up, left and right")]
-    said = lambda values: MISSING if values is None else ", ".join(f"{x:.2f}" for x in values)
-    shares = lambda values: MISSING if values is None else ", ".join(map(_percent, values))
-    table = [
-        (
-            said(r["command"]),
-            said(r["velocity"]),
-            said(r["error"]),
-            f"{r['fell']} of {r['trials']}",
-            shares(r["airborne"]),
-        )
-        for r in rows
-    ]
-    return page.table(columns, table)
-
-
 def _plain(record: Record) -> Html:
     """Return the values of a record without cells, and why its trials failed."""
     values = [(words, f"{_value(record[k])}{u}") for k, (words, u) in PLAIN.items() if k in record]
@@ -332,6 +307,10 @@ def _name(cell: Record) -> str:
     """Return the kind, level and size of a cell, as far as they are known."""
     words = " ".join(str(cell[key]) for key in ("kind", "level") if key in cell)
     return f"{words}, {_size(cell)}" if cell.get("size_m") else words
+
+
+def _place(of: Record) -> str:
+    return _called(of) if "title" in of else _name(of) or "flat ground"
 
 
 def _called(scene: Record) -> str:

@@ -163,7 +163,7 @@ def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
 
 def hardened(robots: Robots, share: Float[Array, ""]) -> Robots:
     """Return the robots with this share of all that is randomised from the next draw on."""
-    spread = jnp.broadcast_to(share, robots.begins.shape)
+    spread = episode.evenly(jnp.broadcast_to(share, robots.begins.shape))
     return robots.replace(env=robots.env.replace(spread=spread))
 
 

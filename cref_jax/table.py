@@ -58,10 +58,14 @@ def world(c: Config, physics: Physics) -> World:
 
 def lanes_of(cell: Cell, count: int, kinds: Sequence[str]) -> Lanes:
     """Return the lanes of so many trials of a cell: kinds and seeds in turn."""
-    kind, level = cell
+    return in_turn(LANES[cell[0]], paper.LEVELS.index(cell[1]), count, kinds)
+
+
+def in_turn(names: Sequence[str], level: int, count: int, kinds: Sequence[str]) -> Lanes:
+    """Return so many lanes of these names and this level, of a world's kinds and seeds in turn."""
     number, variants = np.arange(count), len(evaluation.LANE_SEEDS)
-    of = np.array([kinds.index(lane) for lane in LANES[kind]])
-    first = paper.LEVELS.index(level) * variants
+    of = np.array([kinds.index(lane) for lane in names])
+    first = level * variants
     return Lanes(of[number % len(of)], first + number // len(of) % variants)
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cref_jax import depth, episode, ppo, rollout, sideways, stall
 from cref_jax.config import Config
 from cref_jax.env import Outcome
-from cref_jax.episode import Ending
+from cref_jax.episode import Ending, Spread
 from cref_jax.rollout import Robots
 from cref_jax.world import World
 
@@ -42,6 +42,7 @@ class Asked(NamedTuple):
     number: Int[np.ndarray, " N"]  # from which it starts; twice only on different lanes
     kind: Int[np.ndarray, " N"]  # of the lane
     level: Int[np.ndarray, " N"]
+    spread: Spread | None = None  # [N] each: how much of what is randomised; all when left out
 
 
 class Trials(NamedTuple):
@@ -85,7 +86,7 @@ def begin(
     """Return the robots at the start of the trials of these numbers, on these lanes."""
     key = jax.random.key(SEED + seed)
     arrays = [jnp.asarray(x, jnp.int32) for x in (number, kind, level)]
-    return _begin(world, key, *arrays)
+    return _begin(world, key, *arrays, episode.evenly(np.ones(len(number))))
 
 
 def run(
@@ -113,14 +114,16 @@ def run(
     )  # fmt: skip
     world, walker = jax.device_put((world, walker), NamedSharding(mesh, P()))
     key = jax.random.key(SEED + seed)
+    spread = asked.spread or episode.evenly(np.ones(len(asked.number)))
     found: dict[int, Trials] = {}
     robots, clock = None, 0
     while places.left:
         if not places.courses:
             robots, clock = None, 0
         if _is_in_phase(world.config, clock) and (new := places.filled()).size:
-            lanes = (jnp.asarray(x[places.trial], jnp.int32) for x in asked)
-            begun = _begin_on(world, key, *lanes, mesh)
+            lanes = (jnp.asarray(x[places.trial], jnp.int32) for x in asked[:3])
+            of = jax.tree.map(lambda x: jnp.asarray(x)[places.trial], spread)
+            begun = _begin_on(world, key, *lanes, of, mesh)
             places.begin(new, np.asarray(begun.env.command[:, 0]))
             is_new = np.isin(np.arange(places.trial.size), new)
             robots = begun if robots is None else _replaced(robots, begun, is_new, world.config)
@@ -238,11 +241,12 @@ def _follow(train: ppo.TrainState, world: World, robots: Robots) -> tuple[Robots
 
 def _started(
     world: World, key: PRNGKeyArray, number: Int[Array, " E"],
-    kind: Int[Array, " E"], level: Int[Array, " E"],
+    kind: Int[Array, " E"], level: Int[Array, " E"], spread: Spread,
 ) -> Robots:  # fmt: skip
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(number)
     split = jax.vmap(jax.random.split)(keys)
-    state = jax.vmap(episode.reset, in_axes=(None, 0, 0, 0))(world, split[:, 0], kind, level)
+    reset = jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, 0))
+    state = reset(world, split[:, 0], kind, level, spread)
     return rollout.placed(world, state, split[:, 1])
 
 
@@ -252,15 +256,15 @@ _begin = jax.jit(_started)
 @functools.partial(jax.jit, static_argnames="mesh")
 def _begin_on(
     world: World, key: PRNGKeyArray, number: Int[Array, " E"],
-    kind: Int[Array, " E"], level: Int[Array, " E"], mesh: Mesh,
+    kind: Int[Array, " E"], level: Int[Array, " E"], spread: Spread, mesh: Mesh,
 ) -> Robots:  # fmt: skip
     """Do the same on the devices of the mesh."""
     robots, each = _partition(world.config), P(AXIS)
     start = jax.shard_map(
-        _started, mesh=mesh, in_specs=(P(), P(), each, each, each), out_specs=robots,
+        _started, mesh=mesh, in_specs=(P(), P(), each, each, each, each), out_specs=robots,
         check_vma=False,
     )  # fmt: skip
-    return start(world, key, number, kind, level)
+    return start(world, key, number, kind, level, spread)
 
 
 @functools.partial(jax.jit, static_argnames="c")

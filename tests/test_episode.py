@@ -82,7 +82,7 @@ def test_half_of_the_randomisation_is_half_as_wide(world, resets):
     reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, None)))
     nominal = world.physics.nominal_dynamics()
     for share in (0.0, 0.5):
-        state = reset(world, keys, kinds, levels, jnp.float32(share))
+        state = reset(world, keys, kinds, levels, episode.evenly(share))
         for part, whole, middle in zip(
             *map(jax.tree.leaves, (state.dynamics, resets.dynamics, nominal)), strict=True
         ):
@@ -121,6 +121,36 @@ def test_without_randomisation_every_robot_is_the_nominal_one(world):
     state = episode.reset(world.replace(config=c), jax.random.key(0), jnp.int32(1), jnp.int32(0))
     assert_equal(state.dynamics, world.physics.nominal_dynamics())
     assert not state.joint_offset.any() and int(state.delay) == 0
+
+
+@pytest.mark.parametrize("part", [*episode.Spread._fields, None])
+def test_each_part_is_randomised_alone(world, part):
+    share = episode.Spread(*(jnp.float32(name == part) for name in episode.Spread._fields))
+    keys = jax.random.split(jax.random.key(6), 32)
+    reset = jax.vmap(episode.reset, in_axes=(None, 0, None, None, None))
+    nominal = reset(world, keys, jnp.int32(1), jnp.int32(0), episode.evenly(0.0))
+    state = reset(world, keys, jnp.int32(1), jnp.int32(0), share)
+    fields = {
+        "friction": lambda s: s.dynamics.friction,
+        "mass": lambda s: (s.dynamics.payload, s.dynamics.com_shift),
+        "gains": lambda s: (s.dynamics.kp, s.dynamics.kd),
+        "offsets": lambda s: s.joint_offset,
+        "delay": lambda s: s.delay,
+        "camera": lambda s: (s.camera_pitch, s.camera_shift),
+    }
+    assert_equal(one(nominal).dynamics, world.physics.nominal_dynamics())
+    for name, field in fields.items():
+        if name == part:
+            for a, b in zip(*map(jax.tree.leaves, (field(state), field(nominal))), strict=True):
+                assert (a != b).mean() > 0.7
+        else:
+            assert_equal(field(state), field(nominal))
+    shoved = jax.vmap(episode.pushed, in_axes=(None, 0, None))
+    due, draw = state.replace(push_left=jnp.zeros(32, jnp.int32)), jnp.array([0.5, -0.3])
+    none = jnp.int32(0)
+    draws = episode.Draws(draw, none, jnp.zeros(3), jnp.array(False), none)
+    gained = shoved(world, due, draws).body.qvel - state.body.qvel
+    np.testing.assert_allclose(gained[:, :2], jnp.tile(draw * (part == "pushes"), (32, 1)))
 
 
 # The command

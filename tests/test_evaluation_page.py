@@ -131,6 +131,15 @@ def test_how_far_robots_come_off_their_way_is_shown(tmp_path):
     assert row(written(records.WALK, tmp_path), "flat ground")[1:] == ["14 cm", "26 cm", "38 cm"]
 
 
+def test_success_with_each_part_alone_is_shown(tmp_path):
+    part = {"kind": "gap", "level": "medium", "size_m": 0.5, "trials": 50, "successes": 41}
+    rows = [part | {"part": "pushes", "rate": 0.82}, part | {"part": "noise", "rate": 0.96}]
+    seen = written(records.table() | {"suite": "robust", "parts": rows}, tmp_path)
+    assert "Success with everything randomised" in seen.text
+    assert row(seen, "pushes") == ["pushes", "82.0 %"]
+    assert row(seen, "noise") == ["noise", "96.0 %"]
+
+
 def test_how_commands_are_obeyed_is_shown(tmp_path):
     seen = written(records.COMMANDS, tmp_path)
     assert "33 of 40told to stand, move less than 5 cm" in seen.text

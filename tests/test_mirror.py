@@ -70,7 +70,7 @@ def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
         delay=jnp.zeros_like(state.delay),
         push_left=jnp.full(ROBOTS, 99),
         command_left=jnp.full(ROBOTS, 99),
-        spread=jnp.zeros(ROBOTS),  # no sensor noise
+        spread=jax.tree.map(jnp.zeros_like, state.spread),  # no sensor noise
     )
     image = state.replace(
         body=jax.vmap(lambda b: mirror.body(b, joints))(state.body),

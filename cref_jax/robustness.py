@@ -1,0 +1,151 @@
+"""Success with everything randomised, and with each part of the randomisation alone.
+
+What is drawn for a trial comes from the seed and the trial's number, like its start and command.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from cref_jax import config, evaluation, lanes, paper, ppo, proportion, sideways, trials
+from cref_jax import table as nominal
+from cref_jax.config import Config
+from cref_jax.episode import Spread
+from cref_jax.physics import Physics
+from cref_jax.trials import Trials
+from cref_jax.world import World, make_world
+
+EVERYTHING = "everything"
+PARTS = Spread._fields
+BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
+LEVELS = (*paper.LEVELS, BEYOND)
+BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs of that are not asked
+LANES = nominal.LANES | {"flat": ("flat",)}
+ALONE = (("flat", "easy"), ("stairs", "medium"), ("gap", "medium"), ("platform", "medium"))
+
+
+class Row(NamedTuple):
+    """A cell, and what is randomised in it."""
+
+    part: str  # one of PARTS, or EVERYTHING
+    kind: str
+    level: str
+
+
+def rows() -> list[Row]:
+    """Return every row: the cells with everything, then each part alone on a cell of each kind."""
+    cells = [*paper.METHODS[paper.FULL].success, ("gap", BEYOND), ("platform", BEYOND)]
+    whole = [Row(EVERYTHING, *cell) for cell in cells]
+    return whole + [Row(part, *cell) for part in PARTS for cell in ALONE]
+
+
+def size(kind: str, level: str) -> float:
+    """Return the size of the obstacles, m; 0 on flat ground."""
+    if kind == "flat":
+        return 0.0
+    return BEYOND_SIZES[kind] if level == BEYOND else nominal.sizes()[kind][level]
+
+
+def world(c: Config, physics: Physics) -> World:
+    """Return the world with the lanes of all rows and the project's own ranges of randomisation."""
+    sized = {lane: [size(kind, at) for at in LEVELS] for kind, of in LANES.items() for lane in of}
+    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, evaluation.LANE_SEEDS)
+    c = dataclasses.replace(evaluation.trial_config(c), randomisation=config.Randomisation())
+    return make_world(c, physics).replace(lanes=atlas)
+
+
+def judge(
+    w: World,
+    train: ppo.TrainState,
+    count: int,
+    seed: int,
+    ended: Callable[[int], None] = lambda count: None,
+    asked: Sequence[Row] | None = None,
+) -> list[dict[str, Any]]:
+    """Return what a policy makes of `count` trials of each row; `ended` is told of each end."""
+    every = list(asked or rows())
+    on = [
+        nominal.in_turn(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
+        for row in every
+    ]
+    kind, level = map(np.concatenate, zip(*on, strict=True))
+    spread = jax.tree.map(lambda *x: np.repeat(x, count), *(_spread(row.part) for row in every))
+    # the same start, command and draws on a lane, whatever is randomised there
+    number = np.tile(np.arange(count), len(every))
+    wanted = trials.Asked(number, kind, level, spread)
+    made = trials.run(w, trials.follow(train), wanted, seed, evaluation.block(), ended)
+    part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in made))
+    return [_outcome(row, part(k)) for k, row in enumerate(every)]
+
+
+def overall(found: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return the means of the paper's cells, with everything randomised."""
+    cells = [row for row in found if row["part"] == EVERYTHING and row["level"] in paper.LEVELS]
+    rate = lambda some: proportion.mean(
+        [proportion.wilson(row["successes"], row["trials"]) for row in some]
+    )
+    whole = rate(cells)
+    return {
+        "rate": whole.value,
+        "wilson_low": whole.low,
+        "wilson_high": whole.high,
+        "trained": rate([row for row in cells if row["level"] != "ood"]).value,
+        "ood": rate([row for row in cells if row["level"] == "ood"]).value,
+    }
+
+
+def text(found: Sequence[dict[str, Any]]) -> Table:
+    """Return the cells with everything randomised for the terminal, in percent."""
+    shown = Table(box=None, padding=(0, 1))
+    shown.add_column("success, everything randomised, %", no_wrap=True)
+    for title in ("trials", "ours", "95 %"):
+        shown.add_column(title, justify="right", no_wrap=True)
+    whole = overall(found)
+    for row in (row for row in found if row["part"] == EVERYTHING):
+        name = f"{row['kind']} {100 * row['size_m']:.0f} cm"
+        shown.add_row(name, str(row["trials"]), f"{100 * row['rate']:.1f}", _interval(row))
+    shown.add_row("all twelve", "", f"{100 * whole['rate']:.1f}", _interval(whole))
+    shown.add_row("nine trained", "", f"{100 * whole['trained']:.1f}", "")
+    return shown
+
+
+def alone(found: Sequence[dict[str, Any]]) -> Table:
+    """Return what each part does alone for the terminal, in percent."""
+    shown = Table(box=None, padding=(0, 1))
+    shown.add_column("success with one part alone, %", no_wrap=True)
+    for kind, level in ALONE:
+        name = kind if kind == "flat" else f"{kind} {100 * size(kind, level):.0f} cm"
+        shown.add_column(name, justify="right", no_wrap=True)
+    for part in PARTS:
+        rates = [f"{100 * row['rate']:.0f}" for row in found if row["part"] == part]
+        shown.add_row(part, *rates)
+    return shown
+
+
+def _spread(part: str) -> Spread:
+    if part == EVERYTHING:
+        return Spread(*[np.float32(1.0)] * len(PARTS))
+    return Spread(*(np.float32(name == part) for name in PARTS))
+
+
+def _outcome(row: Row, made: Trials) -> dict[str, Any]:
+    rate = proportion.wilson(int(made.succeeded.sum()), len(made.succeeded))
+    return {
+        **row._asdict(),
+        "size_m": size(row.kind, row.level),
+        "trials": len(made.succeeded),
+        "successes": int(made.succeeded.sum()),
+        "rate": rate.value,
+        "wilson_low": rate.low,
+        "wilson_high": rate.high,
+        "failures": made.failures(),
+        "sideways": sideways.summed(made.drift, made.aside),
+    }
+
+
+def _interval(of: dict[str, Any]) -> str:
+    return f"{100 * of['wilson_low']:.0f}-{100 * of['wilson_high']:.0f}"

@@ -1,0 +1,59 @@
+"""What is asked with everything randomised and with each part alone, and how it is counted."""
+
+import numpy as np
+import pytest
+import sample
+
+from cref_jax import ppo, robustness
+from cref_jax.config import Randomisation
+from cref_jax.robustness import EVERYTHING, PARTS
+
+
+@pytest.fixture(scope="module")
+def world():
+    return robustness.world(sample.C, sample.world().physics)
+
+
+def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():
+    rows = robustness.rows()
+    whole = [row for row in rows if row.part == EVERYTHING]
+    assert len(whole) == 14 and len(rows) == 14 + 8 * 4
+    sizes = {(row.kind, robustness.size(row.kind, row.level)) for row in whole}
+    assert {("gap", 0.90), ("platform", 0.45), ("stairs", 0.23)} < sizes
+    for part in PARTS:
+        assert [row.kind for row in rows if row.part == part] == [
+            "flat", "stairs", "gap", "platform",
+        ]  # fmt: skip
+
+
+def test_the_ranges_are_the_projects_own_whatever_a_policy_was_trained_with(world):
+    assert world.config.randomisation == Randomisation() and world.config.randomisation.enabled
+    assert not world.config.randomisation.ramp
+
+
+def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
+    seen = []
+
+    def run(w, walker, asked, seed, block, ended):
+        seen.append(asked)
+        one = np.ones(len(asked.number), np.float32)
+        ending = (asked.number % 2).astype(int)
+        return robustness.Trials(one, ending, one, one, one, one)
+
+    monkeypatch.setattr(robustness.trials, "run", run)
+    found = robustness.judge(world, ppo.TrainState(*5 * [None]), 10, 0)
+    (asked,) = seen
+    for k, row in enumerate(robustness.rows()):
+        part = slice(10 * k, 10 * k + 10)
+        names = {world.lanes.kinds[kind] for kind in asked.kind[part]}
+        assert names == set(robustness.LANES[row.kind])
+        sizes = world.lanes.sizes[asked.level[part], asked.kind[part]]
+        np.testing.assert_allclose(sizes, robustness.size(row.kind, row.level))
+        shares = {name: set(of[part].tolist()) for name, of in asked.spread._asdict().items()}
+        on = {name for name, share in shares.items() if share == {1.0}}
+        assert on == (set(PARTS) if row.part == EVERYTHING else {row.part})
+        assert all(share in ({0.0}, {1.0}) for share in shares.values())
+        np.testing.assert_array_equal(asked.number[part], np.arange(10))
+        assert (found[k]["part"], found[k]["trials"], found[k]["successes"]) == (row.part, 10, 5)
+    assert robustness.overall(found)["rate"] == 0.5
+    assert "gap 90 cm" in str(robustness.text(found).columns[0]._cells)
