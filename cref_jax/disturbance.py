@@ -1,4 +1,4 @@
-"""What may go wrong between the camera and the policy: lost frames, late frames, blind regions."""
+"""What may go wrong from the camera to the policy: lost, late, partly blind and wrong frames."""
 
 import math
 from typing import NamedTuple
@@ -19,6 +19,9 @@ class Disturbance(NamedTuple):
     dropped: float = 0.0  # share of frames that are lost, each by itself
     latency: int = 1  # control steps from a frame's exposure until the policy has it
     invalid: float = 0.0  # share of the image that reads nothing, as where light is reflected
+    noise: float = 0.0  # m, deviation at 1 m; grows with the distance's square, as stereo's does
+    scale: float = 1.0  # depth read for a depth of 1
+    dead: float = 0.0  # share of columns that read nothing, the same for a whole trial
     seed: int = 0  # of all that is random here
 
 
@@ -30,9 +33,10 @@ class Channel:
 
     def __init__(self, disturbance: Disturbance) -> None:
         self._d = disturbance
-        self._losses, self._holes = (
-            np.random.default_rng([disturbance.seed, k]) for k in range(2)
+        self._losses, self._holes, self._errors = (
+            np.random.default_rng([disturbance.seed, k]) for k in range(3)
         )  # apart, so that one does not change the other
+        self._dead: Bool[np.ndarray, " W"] | None = None
         self._way: list[tuple[int, Frame, float]] = []  # due at a step, frame, exposed at a time
         self._blind: Frame = np.zeros((0, 0))
         self._left = 0  # frames until other regions go blind
@@ -43,6 +47,7 @@ class Channel:
 
     def send(self, frame: Frame, step: int, stamp: float) -> None:
         """Send a frame that was exposed at this control step and time, s."""
+        frame = self._misread(frame)
         if self._d.invalid > 0.0:
             frame = np.where(self._mask(frame.shape), self._blind, frame)
         self._way.append((step + self._d.latency, frame, stamp))
@@ -52,6 +57,22 @@ class Channel:
         if self._way and self._way[0][0] <= step:
             return self._way.pop(0)[1:]
         return None
+
+    def _misread(self, frame: Frame) -> Frame:
+        """Return the frame as a camera reads it that errs; undisturbed it is the same one."""
+        d = self._d
+        if d.scale != 1.0:
+            frame = (d.scale * frame).astype(np.float32)
+        if d.noise > 0.0:
+            error = self._errors.normal(0.0, d.noise, frame.shape) * np.square(frame)
+            frame = np.maximum(frame + error, 0.0).astype(np.float32)
+        if d.dead > 0.0:
+            if self._dead is None:
+                count = round(d.dead * frame.shape[1])
+                which = self._errors.permutation(frame.shape[1])[:count]
+                self._dead = np.isin(np.arange(frame.shape[1]), which)
+            frame = np.where(self._dead, np.float32(0.0), frame)
+        return frame
 
     def _mask(self, shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
         """Return what is blind in this frame; some of it reads 0 and some NaN."""

@@ -55,6 +55,9 @@ CONDITIONS = (
     ),
     *(Condition(f"frames {20 * k} ms late", Disturbance(latency=k)) for k in (1, 2, 3, 4, 5)),
     *(Condition(f"{100 * p:.0f} % of pixels blind", Disturbance(invalid=p)) for p in (0.2, 0.4)),
+    *(Condition(f"noise of {100 * n:g} cm at 1 m", Disturbance(noise=n)) for n in (0.005, 0.02)),
+    *(Condition(f"depth times {k}", Disturbance(scale=k)) for k in (0.95, 1.05)),
+    Condition("a tenth of the columns dead", Disturbance(dead=0.1)),
     *(Condition(f"friction {mu}", friction=mu) for mu in (0.4, 0.6, 0.8, 1.0)),
 )  # latency assumes control steps of 20 ms, Sec. II-D
 

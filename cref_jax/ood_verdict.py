@@ -66,6 +66,9 @@ class ConditionResult(NamedTuple):
     dropped: float  # share of frames
     latency: int  # control steps
     invalid: float  # share of the image
+    noise: float  # m, deviation at 1 m
+    scale: float
+    dead: float  # share of the columns
     friction: float
     trials: int
     successes: int
@@ -143,6 +146,9 @@ def condition_result(condition: Condition, by_scene: dict[str, list[Outcome]]) -
         dropped=condition.disturbance.dropped,
         latency=condition.disturbance.latency,
         invalid=condition.disturbance.invalid,
+        noise=condition.disturbance.noise,
+        scale=condition.disturbance.scale,
+        dead=condition.disturbance.dead,
         friction=condition.friction,
         trials=len(every),
         successes=successes(every),

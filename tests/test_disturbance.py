@@ -95,3 +95,34 @@ def test_losing_frames_does_not_change_which_pixels_are_blind():
         channel.loses_one()
     channel.send(FRAME, 0, 0.0)
     np.testing.assert_array_equal(channel.receive(1)[0], sent(bad, 1)[0])
+
+
+def test_noise_grows_with_the_square_of_the_distance():
+    near, far = (np.full(SHAPE, z, np.float32) for z in (1.0, 2.0))
+    channel = Channel(Disturbance(noise=0.01))
+    for z, frame, deviation in ((1.0, near, 0.01), (2.0, far, 0.04)):
+        channel.send(frame, 0, 0.0)
+        read = channel.receive(1)[0] - z
+        assert read.std() == pytest.approx(deviation, rel=0.05)
+        assert abs(read.mean()) < 4.0 * deviation / np.sqrt(FRAME.size)
+
+
+def test_a_wrong_scale_is_wrong_everywhere():
+    for frame in sent(Disturbance(scale=1.05), 3):
+        np.testing.assert_allclose(frame, 2.1, rtol=1e-6)
+
+
+def test_dead_columns_read_nothing_from_top_to_bottom_all_the_time():
+    frames = np.stack(sent(Disturbance(dead=0.1, seed=2), 20))
+    dead = blind(frames[0]).all(axis=0)
+    assert dead.sum() == 6  # a tenth of 64
+    np.testing.assert_array_equal(blind(frames), np.broadcast_to(dead, frames.shape))
+    other = sent(Disturbance(dead=0.1, seed=3), 1)[0]
+    assert not np.array_equal(blind(other), blind(frames[0]))
+
+
+def test_an_error_changes_nothing_else():
+    bad = Disturbance(invalid=0.3, seed=4)
+    noisy = sent(bad._replace(noise=0.01), 5)
+    for a, b in zip(sent(bad, 5), noisy, strict=True):
+        np.testing.assert_array_equal(blind(a), blind(b))

@@ -98,7 +98,7 @@ def test_the_conditions_are_those_that_were_asked_for():
     assert late == [1, 2, 3, 4, 5]
     assert [c.name for c in CONDITIONS if "late" in c.name][-1] == "frames 100 ms late"
     assert sorted(c.friction for c in CONDITIONS if "friction" in c.name) == [0.4, 0.6, 0.8, 1.0]
-    assert len({c.name for c in CONDITIONS}) == len(CONDITIONS) == 14
+    assert len({c.name for c in CONDITIONS}) == len(CONDITIONS) == 19
 
 
 class Standing(deploy.Policy):
@@ -118,7 +118,7 @@ def test_a_policy_that_does_nothing_passes_nothing(monkeypatch):
     verdict = ood_suite.judge(None, trials=2, stress_trials=1, seconds=2.0, scenes=FEW, workers=1)
     assert verdict.passed == 0
     assert [r.trials for r in verdict.scenes] == [2, 2]
-    assert [r.trials for r in verdict.conditions] == [4] + [2] * 14
+    assert [r.trials for r in verdict.conditions] == [4] + [2] * len(CONDITIONS)
     assert all(r.successes == 0 for r in (*verdict.scenes, *verdict.conditions))
     assert all(sum(r.failures.values()) == r.trials for r in verdict.conditions)
     json.dumps(verdict.as_dict(), allow_nan=False)
