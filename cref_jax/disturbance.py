@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 REGIONS = 3  # at a time, at most; assumed
 REGION_FRAMES = (4, 20)  # how long they stay, from, to: 0.2 to 1 s at 20 Hz; assumed
+FARTHEST = 10.0  # m; noise grows up to there, so that what is far or nowhere stays so; assumed
 WOBBLES = 5  # waves around a region's outline, at most; assumed
 
 Frame = Float[np.ndarray, "H W"]  # z-depth, m
@@ -64,7 +65,8 @@ class Channel:
         if d.scale != 1.0:
             frame = (d.scale * frame).astype(np.float32)
         if d.noise > 0.0:
-            error = self._errors.normal(0.0, d.noise, frame.shape) * np.square(frame)
+            error = self._errors.normal(0.0, d.noise, frame.shape)
+            error *= np.square(np.minimum(frame, FARTHEST))
             frame = np.maximum(frame + error, 0.0).astype(np.float32)
         if d.dead > 0.0:
             if self._dead is None:

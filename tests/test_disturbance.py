@@ -107,6 +107,14 @@ def test_noise_grows_with_the_square_of_the_distance():
         assert abs(read.mean()) < 4.0 * deviation / np.sqrt(FRAME.size)
 
 
+def test_what_is_nowhere_or_far_stays_so_under_noise():
+    channel, frame = Channel(Disturbance(noise=0.02)), FRAME.copy()
+    frame[:10], frame[10:20] = np.inf, 300.0
+    channel.send(frame, 0, 0.0)
+    read, _ = channel.receive(1)
+    assert np.isinf(read[:10]).all() and (read[10:20] > 280.0).all()
+
+
 def test_a_wrong_scale_is_wrong_everywhere():
     for frame in sent(Disturbance(scale=1.05), 3):
         np.testing.assert_allclose(frame, 2.1, rtol=1e-6)
