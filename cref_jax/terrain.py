@@ -140,7 +140,7 @@ def closest_point(
     taken.
     """
     place = _place(terrain, p[0], p[1])
-    around = _read(terrain.tops, [_column(terrain, place, *by) for by in _COLUMNS])
+    around = _read(terrain.tops, _columns_around(terrain, place))
 
     @kernels.apart
     def search(place: _Place, z: Float[Array, ""], around: list[Float[Array, ""]]) -> Any:
@@ -162,7 +162,7 @@ def contact_planes(
     if count not in (1, 2):
         raise ValueError(f"a sphere has 1 or 2 contact planes, not {count}")
     place = _place(terrain, p[0], p[1])
-    around = _read(terrain.tops, [_column(terrain, place, *by) for by in _COLUMNS])
+    around = _read(terrain.tops, _columns_around(terrain, place))
     offsets, outside = _offsets(terrain.cell, place, p[2], around)
     nearest = _nearest(offsets)
     planes = [_plane(p, nearest, outside)]
@@ -235,11 +235,12 @@ def _place(terrain: Terrain, x: Float[Array, ""], y: Float[Array, ""]) -> _Place
     )
 
 
-def _column(terrain: Terrain, place: _Place, a: int, b: int) -> Int[Array, ""]:
-    """Return which column is `a` and `b` further, or the nearest one inside of the window."""
-    i = jnp.clip(place.i + a, 0, terrain.size[0] - 1)
-    j = jnp.clip(place.j + b, 0, place.across - 1)
-    return place.first + i * place.across + j
+def _columns_around(terrain: Terrain, place: _Place) -> list[Int[Array, ""]]:
+    """Return which columns are those of `_COLUMNS`, or the nearest ones inside of the window."""
+    reach, last = range(-_REACH, _REACH + 1), terrain.size[0] - 1
+    row = {a: place.first + jnp.clip(place.i + a, 0, last) * place.across for a in reach}
+    aside = {b: jnp.clip(place.j + b, 0, place.across - 1) for b in reach}
+    return [row[a] + aside[b] for a, b in _COLUMNS]
 
 
 @kernels.apart
