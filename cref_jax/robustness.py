@@ -11,13 +11,13 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from cref_jax import config, evaluation, lanes, paper, ppo, proportion, sideways, trials
+from cref_jax import config, evaluation, paper, ppo, proportion, sideways, trials
 from cref_jax import table as nominal
 from cref_jax.config import Config
 from cref_jax.episode import Spread
 from cref_jax.physics import Physics
 from cref_jax.trials import Trials
-from cref_jax.world import World, make_world
+from cref_jax.world import World
 
 EVERYTHING = "everything"
 PARTS = Spread._fields
@@ -53,9 +53,8 @@ def size(kind: str, level: str) -> float:
 def world(c: Config, physics: Physics) -> World:
     """Return the world with the lanes of all rows and the project's own ranges of randomisation."""
     sized = {lane: [size(kind, at) for at in LEVELS] for kind, of in LANES.items() for lane in of}
-    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, evaluation.LANE_SEEDS)
-    c = dataclasses.replace(evaluation.trial_config(c), randomisation=config.Randomisation())
-    return make_world(c, physics).replace(lanes=atlas)
+    w = nominal.world_of(c, physics, sized)
+    return w.replace(config=dataclasses.replace(w.config, randomisation=config.Randomisation()))
 
 
 def judge(

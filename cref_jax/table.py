@@ -51,8 +51,12 @@ def sizes() -> dict[str, dict[str, float]]:
 def world(c: Config, physics: Physics) -> World:
     """Return the world with the lanes of all cells."""
     sized = {lane: tuple(sizes()[kind].values()) for kind, of in LANES.items() for lane in of}
-    terrain = config.Terrain(cell=c.terrain.cell)
-    atlas = lanes.grid(terrain, sized, evaluation.LANE_SEEDS)
+    return world_of(c, physics, sized)
+
+
+def world_of(c: Config, physics: Physics, sized: Mapping[str, Sequence[float]]) -> World:
+    """Return the world of trials on lanes with obstacles of these sizes of each kind, m."""
+    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, evaluation.LANE_SEEDS)
     return make_world(evaluation.trial_config(c), physics).replace(lanes=atlas)
 
 
