@@ -29,7 +29,6 @@ from cref_jax import (
     learn,
     limits,
     peers,
-    processes,
     rollout,
     roofline,
     runs,
@@ -38,6 +37,7 @@ from cref_jax import (
 from cref_jax.config import Config
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.roofline import Rates
+from cref_jax.system import jax_setup, parallel
 from cref_jax.world import World
 
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
@@ -81,7 +81,7 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.bench")
     with cli.one_line_errors(options.debug):
-        cli.prepare(options.engines)
+        jax_setup.prepare(options.engines)
         rates = roofline.measure()
         rows = measure(options, rates)
         speeds = compare_depth(options) if options.depth else []
@@ -144,7 +144,7 @@ def _engine(
     whole, ours = whole._replace(share=None), ours._replace(share=None)
     if engine != "mujoco":
         return [whole, ours]
-    substeps, threads = world.config.physics.substeps, processes.cores()
+    substeps, threads = world.config.physics.substeps, parallel.cores()
     alone = peers.raw_substep(
         world.physics, robots.env.body, threads, stages.STEPS * substeps, options.repeats
     )
@@ -171,7 +171,7 @@ def _preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
 def _started(c: Config, engine: EngineName) -> tuple[World, learn.RunState]:
     """Return the world and the first state of a run, shared out among the devices."""
     mesh = runs.mesh_of(c)
-    world = runs.world_of(c, engine, max(processes.cores() // mesh.size, 1))
+    world = runs.world_of(c, engine, max(parallel.cores() // mesh.size, 1))
     return world, jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
 
 

@@ -5,8 +5,9 @@ import functools
 import jax
 from brax.training.agents.ppo import networks, train
 
-from cref_jax import config, processes
+from cref_jax import config
 from cref_jax.brax_env import BraxEnv, mend_brax, wrap
+from cref_jax.system import parallel
 
 ITERATIONS = 4  # of each of two parts; the first part compiles
 
@@ -19,7 +20,7 @@ def samples_per_second(c: config.Config) -> float:
     """
     mend_brax()
     seen: list[float] = []
-    robots = BraxEnv(c, threads=max(processes.cores() // jax.device_count(), 1))  # of a device
+    robots = BraxEnv(c, threads=max(parallel.cores() // jax.device_count(), 1))  # of a device
     train.train(
         robots,
         num_timesteps=2 * ITERATIONS * c.run.num_envs * c.ppo.horizon,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 WEIGHTS = {  # measures of the episodes that ended in an iteration, which says 0 if none did
     "episode/length_s": "episode/ended",

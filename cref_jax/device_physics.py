@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.host_physics import Dynamics, Substep
 
 with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed

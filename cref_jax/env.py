@@ -11,17 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from cref_jax import (
-    config,
-    depth,
-    episode,
-    foothold,
-    gait,
-    geometry,
-    observation,
-    reward,
-    terrain,
-)
+from cref_jax import config, depth, episode, foothold, gait, geometry, observation, reward, terrain
 from cref_jax.episode import Ending, EnvState
 from cref_jax.foothold import Soles
 from cref_jax.kinematics import Links

@@ -1,5 +1,7 @@
 """Judge a policy: `python -m cref_jax.eval --suite table`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 import contextlib
 import json
 import tempfile
@@ -8,10 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
-
-from cref_jax import ood_suite  # before numpy and mujoco: it sets their threads and OpenGL
-
-# isort: split
 
 import jax
 import tyro
@@ -24,15 +22,16 @@ from cref_jax import (
     evaluation,
     evaluation_page,
     exported,
+    ood_suite,
     ood_verdict,
     paper,
-    processes,
     robustness,
     runs,
     table,
 )
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.physics import EngineName
+from cref_jax.system import jax_setup, parallel
 from cref_jax.world import World
 
 Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
@@ -88,7 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
-        cli.prepare([options.engine])
+        jax_setup.prepare([options.engine])
         subjects = [_subject(path, options) for path in _sources(options)]
         source = subjects[0].source
         out = options.out or (source if exported.is_run(source) else Path())
@@ -127,7 +126,7 @@ def _sources(options: Options) -> list[Path]:
 def _subject(source: Path, options: Options) -> Subject:
     # trials are shared out among the devices, of which a CPU has one a core
     in_trials = options.suite in ("table", "robust", "cross")
-    threads = max(processes.cores() // jax.device_count(), 1) if in_trials else 0
+    threads = max(parallel.cores() // jax.device_count(), 1) if in_trials else 0
     world = runs.world_of(exported.read_config(source), options.engine, threads)
     return Subject(source, exported.load(source, world), world)
 

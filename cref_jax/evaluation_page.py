@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cref_jax import evaluation_tables, outcomes, page, shapes
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.outcomes import Failures, Line, Share, called
 from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
 

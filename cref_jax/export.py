@@ -1,15 +1,14 @@
 """Write a policy for the robot: `python -m cref_jax.export --run runs/NAME --out policy/`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import deploy  # before numpy, whose number of threads it sets
-
-# isort: split
-
 import tyro
 
-from cref_jax import cli, exported, learner, runs
+from cref_jax import cli, deploy, exported, learner, runs
+from cref_jax.system import jax_setup
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.export")
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         if options.learner:
             _write_learner(
                 options.run or runs.newest(), cli.writable(options.learner, ".npz", "--learner")

@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from cref_jax import config, deploy, learn, learner, leaves, ppo, robot, runs, vectors
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
 

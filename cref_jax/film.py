@@ -1,27 +1,19 @@
-"""Pictures to files, and the OpenGL that draws them: import this before mujoco.
+"""Pictures to files."""
 
-mujoco reads MUJOCO_GL at its first import, and fails there if the library is missing.
-"""
+import cref_jax.system.startup  # noqa: F401
 
 import contextlib
 import itertools
-import os
 import subprocess
-import sys
 from collections.abc import Iterable
-from ctypes.util import find_library
 from pathlib import Path
-
-if sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
-    has = [name for name, file in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(file)]
-    os.environ.setdefault("MUJOCO_GL", has[0] if has else "off")
 
 import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 Frame = UInt8[np.ndarray, "height width 3"]
 

@@ -26,7 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from cref_jax import cli, depth, hlo, lanes, learn, limits, runs
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.physics import Backend, Body, Physics
 from cref_jax.world import World
 

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco.batch import Batch
 
-from cref_jax import host_call, processes
+from cref_jax import host_call
+from cref_jax.system import parallel
 
 _TARGET = "cref_jax_mujoco_substep"
 _ENGINES: "dict[int, HostEngine]" = {}  # the first one of each number, which steps for all
@@ -51,7 +52,7 @@ class HostEngine:
         """Take the compiled model with one force sensor a foot, and the trunk's body number."""
         self._model = model
         self._trunk = trunk
-        self._threads = threads or processes.cores()
+        self._threads = threads or parallel.cores()
         self._number = _number(model, trunk, self._threads)
         _ENGINES.setdefault(self._number, self)
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 from PIL import Image
 
 from cref_jax import config, terrain
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.shapes import KINDS, Heights, Range, columns, level_places
 from cref_jax.terrain import Grid, Terrain
 

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from cref_jax import config, learn, leaves
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
 

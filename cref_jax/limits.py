@@ -1,6 +1,7 @@
 """Which settings can run: what is wrong is said before anything is compiled."""
 
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 
 
 def check(c: Config) -> None:

@@ -16,17 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cref_jax import config, patches
 from cref_jax.holding import Holding, by_frame, by_step, holding, repeated
-from cref_jax.layers import (
-    GRU,
-    LSTM,
-    MLP,
-    Convolution,
-    LayerNorm,
-    PatchFilter,
-    dense,
-    elu,
-    product,
-)
+from cref_jax.layers import GRU, LSTM, MLP, Convolution, LayerNorm, PatchFilter, dense, elu, product
 
 _BLOCK = 8  # pixels, side of the blocks of the depth compression
 _HEAD_SCALE = 0.01  # of the last layer of the action head; assumed: the first actions are near zero

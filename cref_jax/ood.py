@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cref_jax import config, lanes, scene
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 BORDER = 4.0  # m of floor around the path; assumed: further than the camera sees
 DITCH = 1.0  # m, depth of a ditch; as deep as the trained gaps

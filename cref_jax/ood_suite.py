@@ -5,6 +5,8 @@ scene's name and its own number, so that it is the same whatever else is asked f
 under every condition: what differs between two conditions is what they do.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 import functools
 import math
 import zlib
@@ -12,34 +14,29 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from cref_jax import deploy  # before numpy, whose number of threads it sets
-
-# isort: split
-
-from cref_jax.film import write_video  # before mujoco, whose OpenGL it chooses
-
-# isort: split
-
 import numpy as np
 from rich.progress import track
 
 from cref_jax import (
+    deploy,
     evaluation,
     exported,
     ood,
     ood_verdict,
-    processes,
     robot,
     scene,
     sideways,
     stand_in,
 )
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
 from cref_jax.disturbance import UNDISTURBED, Disturbance
+from cref_jax.errors import ConfigError
 from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
+from cref_jax.film import write_video
 from cref_jax.ood import Scene
 from cref_jax.ood_verdict import Condition, Outcome, Verdict
 from cref_jax.stand_in import StandIn, Start, Trial
+from cref_jax.system import parallel
 
 START_X, START_Y = (0.5, 1.0), (-0.3, 0.3)  # m; assumed: as in training
 START_YAW = (-0.2, 0.2)  # rad; assumed
@@ -109,7 +106,7 @@ def judge(
         for number in range(trials if condition is GOOD else stress_trials)
     ]
     table = {condition: {name: [] for name in found} for condition in conditions}
-    outcomes = processes.run(_Runner, arguments, jobs, workers)
+    outcomes = parallel.run(_Runner, arguments, jobs, workers)
     for job, outcome in zip(jobs, outcomes, strict=True):
         table[job.condition][job.scene].append(outcome)
     titles = {name: ground.title for name, ground in found.items()}

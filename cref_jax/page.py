@@ -18,7 +18,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 MEGABYTE = 1_000_000  # bytes
 MOST_PICTURE = 8 * MEGABYTE  # bytes of a file; assumed: far above any still of this program

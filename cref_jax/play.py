@@ -3,6 +3,8 @@
 Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 import dataclasses
 import functools
 import math
@@ -11,10 +13,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeVar
-
-from cref_jax import film  # before mujoco, whose OpenGL it chooses
-
-# isort: split
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +26,7 @@ from cref_jax import (
     config,
     evaluation,
     exported,
+    film,
     foothold,
     lanes,
     network,
@@ -38,8 +37,10 @@ from cref_jax import (
     runs,
     scene,
 )
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.lanes import Atlas
+from cref_jax.system import jax_setup
 from cref_jax.world import World
 
 T = TypeVar("T")
@@ -128,7 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.play")
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         play(options)
 
 

@@ -1,17 +1,15 @@
 """Gather what is known about a run into one page: `python -m cref_jax.report --run runs/NAME`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cref_jax import deploy  # before numpy, whose number of threads it sets
-
-# isort: split
-
 import tyro
 
-from cref_jax import cli, exported, page, run_page
-from cref_jax.config import ConfigError
+from cref_jax import cli, deploy, exported, page, run_page
+from cref_jax.errors import ConfigError
 from cref_jax.page import Column, Html, Section, code, join
 
 

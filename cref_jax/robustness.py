@@ -11,8 +11,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from cref_jax import config, evaluation, paper, ppo, proportion, sideways, trials
-from cref_jax import table as nominal
+from cref_jax import config, evaluation, paper, ppo, proportion, sideways, table, trials
 from cref_jax.config import Config
 from cref_jax.episode import Spread
 from cref_jax.physics import Physics
@@ -24,7 +23,7 @@ PARTS = Spread._fields
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs of that are not asked
-LANES = nominal.LANES | {"flat": ("flat",)}
+LANES = table.LANES | {"flat": ("flat",)}
 ALONE = (("flat", "easy"), ("stairs", "medium"), ("gap", "medium"), ("platform", "medium"))
 
 
@@ -47,13 +46,13 @@ def size(kind: str, level: str) -> float:
     """Return the size of the obstacles, m; 0 on flat ground."""
     if kind == "flat":
         return 0.0
-    return BEYOND_SIZES[kind] if level == BEYOND else nominal.sizes()[kind][level]
+    return BEYOND_SIZES[kind] if level == BEYOND else table.sizes()[kind][level]
 
 
 def world(c: Config, physics: Physics) -> World:
     """Return the world with the lanes of all rows and the project's own ranges of randomisation."""
     sized = {lane: [size(kind, at) for at in LEVELS] for kind, of in LANES.items() for lane in of}
-    w = nominal.world_of(c, physics, sized)
+    w = table.world_of(c, physics, sized)
     return w.replace(config=dataclasses.replace(w.config, randomisation=config.Randomisation()))
 
 
@@ -68,7 +67,7 @@ def judge(
     """Return what a policy makes of `count` trials of each row; `ended` is told of each end."""
     every = list(asked or rows())
     on = [
-        nominal.in_turn(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
+        table.in_turn(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
         for row in every
     ]
     kind, level = map(np.concatenate, zip(*on, strict=True))

@@ -14,10 +14,11 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, kernels, losses, network, ppo, readout
+from cref_jax import config, depth, env, episode, losses, network, ppo, readout
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
+from cref_jax.system import xla_kernels
 from cref_jax.world import World
 
 
@@ -233,8 +234,8 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pix
         some = np.flatnonzero(is_profile == flag)
         if some.size:
             part = jax.tree.map(lambda x, some=some: x[some], state)
-            look = kernels.apart(functools.partial(_images, is_profile=flag))
-            images.append(kernels.stored(look(world, part)))
+            look = xla_kernels.as_own_kernel(functools.partial(_images, is_profile=flag))
+            images.append(xla_kernels.materialize(look(world, part)))
             robots.append(some)
     image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
     return network.in_patches(world.config.network, image)

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cref_jax import curves, evaluation_page, learning_charts, page
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
 from cref_jax.curves import Log
+from cref_jax.errors import ConfigError
 from cref_jax.page import MISSING, Column, Html, Section, code, join, note, paragraph
 
 MOST_MEDIA = (

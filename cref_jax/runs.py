@@ -22,9 +22,10 @@ import jax
 from jax.sharding import Mesh
 
 from cref_jax import config, learn, ppo
-from cref_jax.checkpoint import Checkpoints
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.physics import EngineName, Physics, resolve_engine
+from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.world import World, make_world
 
 ROOT = Path("runs")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cref_jax import config, robot
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.film import Frame
 from cref_jax.terrain import Terrain
 

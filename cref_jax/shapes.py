@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from cref_jax import config
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 START = 1.5  # m, level ground at the start; assumed: the robot is put down at 0.5 to 1 m
 END = 1.0  # m, level ground at the end, at least; assumed

@@ -1,5 +1,7 @@
 """An exported policy on the robot's stand-in: `python -m cref_jax.sim2sim --policy policy/`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 import dataclasses
 import json
 from collections import Counter
@@ -7,26 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cref_jax import deploy  # before numpy, whose number of threads it sets
-
-# isort: split
-
-from cref_jax import film  # before mujoco, whose OpenGL it chooses
-
-# isort: split
-
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, evaluation, exported, processes, runs, scene, stand_in, transfer
-from cref_jax.config import Config, ConfigError
+from cref_jax import cli, deploy, evaluation, exported, film, runs, scene, stand_in, transfer
+from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
+from cref_jax.errors import ConfigError
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.physics import Physics
 from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
+from cref_jax.system import jax_setup, parallel
 from cref_jax.world import World
 
 FRAME_RATE = 25.0  # 1/s, of a film
@@ -65,7 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.sim2sim")
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         if options.trials < 1:
             raise ConfigError(f"--trials must be at least 1, not {options.trials}")
         if options.film and options.film.suffix != ".mp4":
@@ -133,7 +129,7 @@ def walked(world: World, path: Path, options: Options) -> list[Trial]:
     lanes = [lane_of(world, level) for level in range(world.lanes.levels)]
     _, levels = evaluation.crossing_lanes(options.trials)
     jobs = list(zip(starts(world, options.seed, options.trials), levels.tolist(), strict=True))
-    return processes.run(_Walker, (world.config, path, lanes, options.latency), jobs)
+    return parallel.run(_Walker, (world.config, path, lanes, options.latency), jobs)
 
 
 class _Walker:

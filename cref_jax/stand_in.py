@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from cref_jax import config, robot, scene, stall
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
 from cref_jax.deploy import Policy, Status
 from cref_jax.disturbance import UNDISTURBED, Channel, Disturbance
+from cref_jax.errors import ConfigError
 
 MOST_BOXES = 20_000
 MARGIN = 4.0  # m around the lane where its border goes on, as in training; further than is seen

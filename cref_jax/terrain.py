@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from cref_jax import kernels
+from cref_jax.system import xla_kernels
 
 FAR = 1.0  # m, distance of a contact plane that is not there
 BLOCKS = (1, 4, 16, 64)  # columns, sides of the blocks whose tops are stored; powers of two
@@ -142,7 +142,7 @@ def closest_point(
     place = _place(terrain, p[0], p[1])
     around = _read(terrain.tops, _columns_around(terrain, place))
 
-    @kernels.apart
+    @xla_kernels.as_own_kernel
     def search(place: _Place, z: Float[Array, ""], around: list[Float[Array, ""]]) -> Any:
         offsets, outside = _offsets(terrain.cell, place, z, around)
         return _nearest(offsets), outside
@@ -213,7 +213,7 @@ class _Offset(NamedTuple):
     square: Float[Array, ""]
 
 
-@kernels.apart
+@xla_kernels.as_own_kernel
 def _place(terrain: Terrain, x: Float[Array, ""], y: Float[Array, ""]) -> _Place:
     """Return where a point is."""
     x = (x - terrain.origin[0]) * (1.0 / terrain.cell)  # columns
@@ -243,7 +243,7 @@ def _columns_around(terrain: Terrain, place: _Place) -> list[Int[Array, ""]]:
     return [row[a] + aside[b] for a, b in _COLUMNS]
 
 
-@kernels.apart
+@xla_kernels.as_own_kernel
 def _column_under(
     terrain: Terrain, x: Float[Array, "*n"], y: Float[Array, "*n"]
 ) -> Int[Array, "*n"]:
@@ -255,7 +255,7 @@ def _column_under(
     return terrain.parts[0] + i * terrain.across[0] + j
 
 
-@kernels.apart
+@xla_kernels.as_own_kernel
 def _read(tops: Float[Array, " N"], columns: list[Int[Array, "*n"]]) -> list[Float[Array, "*n"]]:
     """Return the heights of the columns of these numbers, m."""
     # unsigned: a number that may be negative would be looked at once more

@@ -16,11 +16,13 @@ import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, evaluation, exported, learn, learner, limits, processes, runs
-from cref_jax.checkpoint import Checkpoints, lock
-from cref_jax.config import Config, ConfigError
+from cref_jax import cli, errors, evaluation, exported, learn, learner, limits, runs
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.progress import Reporter
+from cref_jax.system import interrupts, jax_setup, parallel
+from cref_jax.training.checkpoint import Checkpoints, lock
 from cref_jax.world import World
 
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
@@ -79,7 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with cli.one_line_errors(debug="--debug" in arguments):
-        cli.prepare([_options(arguments).engine])
+        jax_setup.prepare([_options(arguments).engine])
         options, c = parse(arguments)
         if options.print_config:
             print(json.dumps(dataclasses.asdict(c), indent=2))
@@ -141,7 +143,7 @@ def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
     run = options.run_dir or runs.ROOT / _name(options)
     mesh = runs.mesh_of(c, options.devices)
-    threads = max(processes.cores() // mesh.size, 1)
+    threads = max(parallel.cores() // mesh.size, 1)
     # what is wrong with the terrain is said before anything is written
     world = jax.device_put(
         runs.world_of(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
@@ -210,7 +212,7 @@ def _loop(
         report.say(f"nothing left to do: {done} of {c.run.iterations} iterations are done")
         return state
     saved = time.monotonic()
-    with cli.StopRequest() as stop:
+    with interrupts.StopRequest() as stop:
         while done < c.run.iterations and not stop.asked:
             program = programs.of(min(c.run.chunk, c.run.iterations - done))
             begun = time.monotonic()
@@ -282,11 +284,11 @@ def _check_health(log: Mapping[str, np.ndarray], samples: int) -> None:
     """
     unstable = float(log["episode/unstable"].max()) / samples
     if unstable > MAX_UNSTABLE:
-        raise cli.TrainingError(
+        raise errors.TrainingError(
             f"the physics blew up in {unstable:.1%} of the samples; the last checkpoint is good"
         )
     if float(log["loss/skipped"].min()) == 1.0:
-        raise cli.TrainingError("no gradient was finite; the last checkpoint is good")
+        raise errors.TrainingError("no gradient was finite; the last checkpoint is good")
 
 
 def _headline(run: Path, c: Config, options: Options, first: int) -> str:

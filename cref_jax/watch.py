@@ -33,8 +33,9 @@ from cref_jax import (
     scene,
     trials,
 )
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
 from cref_jax.env import Outcome
+from cref_jax.errors import ConfigError
 from cref_jax.lanes import Atlas
 from cref_jax.physics import EngineName
 from cref_jax.runs import Policy

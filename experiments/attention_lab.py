@@ -38,7 +38,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from cref_jax import cli, gaze, profile, watch
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
+from cref_jax.system import jax_setup
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -111,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         out = cli.writable(options.out, ".png")
         policy, world = watch.opened(options.run, options.policy, options.engine)
         c = policy.config

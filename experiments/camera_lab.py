@@ -11,13 +11,11 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import ood_suite  # before numpy and mujoco: it sets their threads and OpenGL
+from cref_jax import deploy, exported, ood, ood_suite
 
 # isort: split
 
 import tyro
-
-from cref_jax import deploy, exported, ood
 
 SCENES = Path(__file__).parent / "holes"
 

@@ -42,7 +42,8 @@ from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
 from cref_jax import cli, evaluation, exported, foothold, kinematics, lanes, profile, terrain, watch
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
+from cref_jax.system import jax_setup
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -132,7 +133,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         out = cli.writable(options.out, ".png")
         found = {label: measured(path, options) for label, path in named(options).items()}
         for label, ways in found.items():

@@ -31,7 +31,9 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from matplotlib.axes import Axes
 
 from cref_jax import cli, profile, watch
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
+from cref_jax.system import jax_setup
 from cref_jax.terrain import Terrain
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
@@ -93,7 +95,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
-        cli.prepare()
+        jax_setup.prepare()
         out = cli.writable(options.out, ".png")
         policy, world = watch.opened(options.run, options.policy, options.engine)
         c = policy.config

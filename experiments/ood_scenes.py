@@ -7,7 +7,9 @@ depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import film  # before mujoco, whose OpenGL it chooses
+from cref_jax import config, film, ood, robot, scene, stand_in
+from cref_jax.config import Config
+from cref_jax.stand_in import StandIn
 
 # isort: split
 
@@ -18,10 +20,6 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 import tyro
-
-from cref_jax import config, ood, robot, scene, stand_in
-from cref_jax.config import Config
-from cref_jax.stand_in import StandIn
 
 COLUMNS = 4
 SIZE = (480, 360)  # pixels of a picture, of the depth image's proportions

@@ -53,11 +53,11 @@ def world():
 
 
 @pytest.fixture
-def resets():
+def fresh_states():
     """Return 512 robots at their start."""
     import sample
 
-    return sample.resets()
+    return sample.fresh_states()
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def world() -> World:
 
 
 @functools.cache
-def resets() -> EnvState:
+def fresh_states() -> EnvState:
     """Return 512 robots at their start, of every kind and level in turn."""
     number, lanes = np.arange(512), world().lanes
     kinds, levels = jnp.asarray(lanes.kind_of(number)), jnp.asarray(number // len(lanes.turns) % 3)
@@ -36,7 +36,7 @@ def resets() -> EnvState:
 
 def robots() -> EnvState:
     """Return eight robots, one a kind and two on stairs up."""
-    return one(resets(), np.arange(ROBOTS))
+    return one(fresh_states(), np.arange(ROBOTS))
 
 
 def one(tree, index=0):

@@ -20,8 +20,10 @@ import numpy as np
 import optax
 import pytest
 
-from cref_jax import checkpoint, leaves
-from cref_jax.checkpoint import CheckpointError, Checkpoints, DamagedCheckpoint
+from cref_jax import leaves
+from cref_jax.errors import CheckpointError, DamagedCheckpoint
+from cref_jax.training import checkpoint
+from cref_jax.training.checkpoint import Checkpoints
 
 # A read that fails leaves threads of orbax behind that complain of a closed loop.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

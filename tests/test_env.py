@@ -235,16 +235,16 @@ def random_walk(world, state, steps: int):
 
 
 @pytest.mark.slow
-def test_256_robots_survive_10_s_of_random_actions(world, resets):
-    sound, ending = random_walk(world, one(resets, np.arange(256)), steps=500)
+def test_256_robots_survive_10_s_of_random_actions(world, fresh_states):
+    sound, ending = random_walk(world, one(fresh_states, np.arange(256)), steps=500)
     assert sound.all() and not ending.unstable.any()
     assert ending.terminated.sum() > 256  # they have fallen, and gone on
 
 
 @pytest.mark.slow
-def test_64_robots_survive_2_s_of_random_actions_in_mjx(world, resets):
+def test_64_robots_survive_2_s_of_random_actions_in_mjx(world, fresh_states):
     in_mjx = world.replace(physics=Physics(C.robot, C.physics, "mjx"))
-    sound, ending = random_walk(in_mjx, one(resets, np.arange(64)), steps=100)
+    sound, ending = random_walk(in_mjx, one(fresh_states, np.arange(64)), steps=100)
     assert sound.all() and not ending.unstable.any()
 
 

@@ -17,9 +17,9 @@ PERIOD = C.physics.control_period
 # The start
 
 
-def test_a_robot_starts_from_a_settled_state_turned_and_moved_in_its_lane(world, resets):
+def test_a_robot_starts_from_a_settled_state_turned_and_moved_in_its_lane(world, fresh_states):
     c, bank = C.episode, world.bank
-    qpos, qvel = np.asarray(resets.body.qpos), np.asarray(resets.body.qvel)
+    qpos, qvel = np.asarray(fresh_states.body.qpos), np.asarray(fresh_states.body.qvel)
     same = (qpos[:, None, 7:] == np.asarray(bank.qpos)[None, :, 7:]).all(-1)
     assert same.sum(axis=1).tolist() == [1] * len(qpos)  # one state of the bank, its joints as is
     assert same.any(axis=0).all()  # and each of them is used
@@ -29,15 +29,17 @@ def test_a_robot_starts_from_a_settled_state_turned_and_moved_in_its_lane(world,
     for column, (low, high) in ((0, c.start_x), (1, c.start_y)):
         assert low <= qpos[:, column].min() < low + 0.05
         assert high - 0.05 < qpos[:, column].max() <= high
-    np.testing.assert_array_equal(resets.start, qpos[:, :2])
-    turn = np.asarray(geometry.yaw(resets.body.qpos[:, 3:7]) - geometry.yaw(bank.qpos[source, 3:7]))
+    np.testing.assert_array_equal(fresh_states.start, qpos[:, :2])
+    turn = np.asarray(
+        geometry.yaw(fresh_states.body.qpos[:, 3:7]) - geometry.yaw(bank.qpos[source, 3:7])
+    )
     assert 0.95 * c.yaw_jitter < np.abs(turn).max() <= c.yaw_jitter + 1e-5
     own_frame = lambda body: geometry.rotate_inverse(body.qpos[:, 3:7], body.qvel[:, :3])
     expected = own_frame(one(world.bank, source))
-    np.testing.assert_allclose(own_frame(resets.body), expected, atol=1e-6)
+    np.testing.assert_allclose(own_frame(fresh_states.body), expected, atol=1e-6)
 
 
-def test_a_robot_starts_standing_on_its_lane(world, resets):
+def test_a_robot_starts_standing_on_its_lane(world, fresh_states):
     spheres = world.physics.robot.spheres
 
     def clearance(state):
@@ -46,17 +48,19 @@ def test_a_robot_starts_standing_on_its_lane(world, resets):
         centre = kinematics.points(links, spheres.body, spheres.position)
         return centre[:, 2] - spheres.radius - terrain.height_at(ground, centre[:, :2])
 
-    lowest = np.asarray(jax.jit(jax.vmap(clearance))(resets)).min(axis=1)
+    lowest = np.asarray(jax.jit(jax.vmap(clearance))(fresh_states)).min(axis=1)
     assert lowest.min() > -0.005 and lowest.max() < 0.001
-    assert np.abs(resets.body.qvel[:, :3]).max() < 0.2
-    np.testing.assert_array_equal(resets.step, 0)
+    assert np.abs(fresh_states.body.qvel[:, :3]).max() < 0.2
+    np.testing.assert_array_equal(fresh_states.step, 0)
 
 
-def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obstacle(world, resets):
+def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obstacle(
+    world, fresh_states
+):
     c = config.override(C, {"episode": {"start_anywhere": 0.5}})
     reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
     keys = jax.random.split(jax.random.key(3), 512)
-    state = reset(world.replace(config=c), keys, resets.kind, jnp.full(512, 2))
+    state = reset(world.replace(config=c), keys, fresh_states.kind, jnp.full(512, 2))
     x, kinds = np.asarray(state.body.qpos[:, 0]), np.array(world.lanes.kinds)[state.kind]
     away = x > 1.1  # m; the level start is 1.5 m long
     assert not away[(kinds == "flat") | (kinds == "rough")].any()  # nothing lies ahead there
@@ -73,39 +77,39 @@ def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obsta
     assert float(jnp.abs(under[away]).max()) > 0.15  # on landings and boxes, too
     assert float(under[kinds == "gap"].min()) == 0.0  # not in a trench
     rise = state.body.qpos[:, 2] - under
-    np.testing.assert_allclose(rise, resets.body.qpos[:, 2].mean(), atol=0.02)
+    np.testing.assert_allclose(rise, fresh_states.body.qpos[:, 2].mean(), atol=0.02)
 
 
-def test_half_of_the_randomisation_is_half_as_wide(world, resets):
-    kinds, levels = resets.kind, resets.level
-    keys = jax.random.split(jax.random.key(3), 512)  # those of `resets`
+def test_half_of_the_randomisation_is_half_as_wide(world, fresh_states):
+    kinds, levels = fresh_states.kind, fresh_states.level
+    keys = jax.random.split(jax.random.key(3), 512)  # those of `fresh_states`
     reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, None)))
     nominal = world.physics.nominal_dynamics()
     for share in (0.0, 0.5):
         state = reset(world, keys, kinds, levels, episode.evenly(share))
         for part, whole, middle in zip(
-            *map(jax.tree.leaves, (state.dynamics, resets.dynamics, nominal)), strict=True
+            *map(jax.tree.leaves, (state.dynamics, fresh_states.dynamics, nominal)), strict=True
         ):
             np.testing.assert_allclose(
                 part, middle + share * (whole - middle), rtol=1e-4, atol=1e-5
             )
         for name in ("joint_offset", "camera_pitch", "camera_shift"):
             np.testing.assert_allclose(
-                getattr(state, name), share * getattr(resets, name), rtol=1e-5
+                getattr(state, name), share * getattr(fresh_states, name), rtol=1e-5
             )
         assert int(state.delay.max()) == {0.0: 0, 0.5: 2}[share]
 
 
-def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, resets):
+def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, fresh_states):
     r, nominal = C.randomisation, world.physics.nominal_dynamics()
-    drawn = resets.dynamics
+    drawn = fresh_states.dynamics
     for values, low, high in (
         (drawn.friction, *r.friction),
         (drawn.payload, -r.trunk_mass, r.trunk_mass),
         (drawn.com_shift, -r.trunk_com, r.trunk_com),
         (drawn.kp / nominal.kp, *r.gains),
         (drawn.kd / nominal.kd, *r.gains),
-        (resets.joint_offset, -r.joint_offset, r.joint_offset),
+        (fresh_states.joint_offset, -r.joint_offset, r.joint_offset),
     ):
         values, slack = np.asarray(values), 1e-5 * (high - low)
         assert (values.min(axis=0) >= low - slack).all() and (
@@ -113,7 +117,7 @@ def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, resets):
         ).all()
         assert (np.ptp(values, axis=0) > 0.97 * (high - low)).all()
     # 0 to 20 ms in substeps of 5 ms
-    assert sorted(set(np.asarray(resets.delay).tolist())) == [0, 1, 2, 3, 4]
+    assert sorted(set(np.asarray(fresh_states.delay).tolist())) == [0, 1, 2, 3, 4]
 
 
 def test_without_randomisation_every_robot_is_the_nominal_one(world):
@@ -156,10 +160,10 @@ def test_each_part_is_randomised_alone(world, part):
 # The command
 
 
-def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, resets):
-    c, command = C.command, np.asarray(resets.command)
-    is_open = np.asarray(resets.kind) == world.lanes.kinds.index("flat")
-    is_steered = np.asarray(resets.is_steered)
+def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, fresh_states):
+    c, command = C.command, np.asarray(fresh_states.command)
+    is_open = np.asarray(fresh_states.kind) == world.lanes.kinds.index("flat")
+    is_steered = np.asarray(fresh_states.is_steered)
     assert not is_steered[is_open].any()
     assert 0.85 < is_steered[~is_open].mean() < 0.95  # all but a tenth
     elsewhere = command[~is_open & ~is_steered]
@@ -176,7 +180,7 @@ def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, r
         assert np.ptp(free[:, column]) > 0.8 * (high - low)
 
 
-def test_parts_of_a_command_in_the_open_are_0_at_times(world, resets):
+def test_parts_of_a_command_in_the_open_are_0_at_times(world, fresh_states):
     c = config.override(C, {"command": {"zero": 0.5, "standing": 0.0}})
     draw = jax.vmap(episode._drawn_command, in_axes=(None, 0, None))
     keys, flat = jax.random.split(jax.random.key(4), 2000), world.lanes.kinds.index("flat")

@@ -9,7 +9,7 @@ import records
 from reading import leaves, read
 
 from cref_jax import evaluation_page, outcomes
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 

@@ -9,7 +9,7 @@ import pytest
 from random_policy import ROBOT, SMALL, J, policy, recorded
 
 from cref_jax import config, deploy, exported, robot, vectors
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 
 @pytest.fixture

@@ -5,7 +5,8 @@ import importlib.util
 import pytest
 
 from cref_jax import gpu_program, hlo
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 
 H100 = gpu_program.CARDS["h100"]
 

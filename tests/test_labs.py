@@ -16,7 +16,8 @@ from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
 from cref_jax import cli, config, exported, gaze, lanes, profile, runs, watch
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.profile import DOWN, UP
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cref_jax import config, lanes, terrain
-from cref_jax.config import ConfigError
+from cref_jax import config, errors, lanes, terrain
+from cref_jax.errors import ConfigError
 
 CELL = 0.02  # m
 TRAIN = {  # m, Table II where it has the kind
@@ -73,7 +73,7 @@ def test_robots_are_put_on_the_kinds_in_turn_as_often_as_their_shares_ask_for(mi
 def test_shares_that_mean_nothing_are_refused(shares, says, tmp_path):
     file = tmp_path / "mine.toml"
     file.write_text(f'mix = ["flat", "gap"]\n[shares]\n{shares}\n')
-    with pytest.raises(config.ConfigError, match=re.escape(says)):
+    with pytest.raises(errors.ConfigError, match=re.escape(says)):
         lanes.build(config.Terrain(name=str(file)))
 
 

@@ -9,7 +9,7 @@ import pytest
 from random_policy import SMALL
 
 from cref_jax import config, exported, learn, learner
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
 
 

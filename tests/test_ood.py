@@ -7,9 +7,10 @@ import stepper
 from random_policy import ROBOT
 
 from cref_jax import config, deploy, evaluation, lanes, ood, robot, stand_in
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Channel, Disturbance
+from cref_jax.errors import ConfigError
 from cref_jax.stand_in import StandIn, Start
 
 C = evaluation.evaluation_config(Config())

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cref_jax import deploy, exported, ood, ood_suite, ood_verdict, processes, scene
-from cref_jax.config import ConfigError
+from cref_jax import deploy, exported, ood, ood_suite, ood_verdict, scene
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Disturbance
+from cref_jax.errors import ConfigError
 from cref_jax.ood_suite import CONDITIONS, GOOD
 from cref_jax.ood_verdict import Condition, Outcome
+from cref_jax.system import parallel
 
 FEW = {name: ood.named(name) for name in ("flagstones", "steel_grate")}
 
@@ -30,7 +31,7 @@ def runner():
 
 
 def outcomes(jobs, seed=0, workers=1):
-    return processes.run(ood_suite._Runner, arguments(seed), jobs, workers)
+    return parallel.run(ood_suite._Runner, arguments(seed), jobs, workers)
 
 
 def jobs(count, condition=GOOD):

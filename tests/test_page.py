@@ -9,7 +9,7 @@ from PIL import Image
 from reading import Page, leaves, read
 
 from cref_jax import page
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.page import Column, Section
 
 EVIL = """<script>alert("1")</script>&amp;'"><img src=x onerror=alert(1)>"""

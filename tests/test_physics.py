@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from cref_jax import config, geometry, kinematics, robot, terrain
+from cref_jax import config, errors, geometry, kinematics, robot, terrain
 from cref_jax.host_physics import Dynamics
 from cref_jax.physics import Body, Physics, resolve_engine
 
@@ -471,7 +471,7 @@ def test_batches_of_batches_have_room_for_every_contact(physics, x2, put_down, e
 def test_an_engine_that_is_not_installed_is_one_line(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(
-        config.ConfigError, match=r"'warp' needs .*: pip install 'cref-jax\[warp\]'"
+        errors.ConfigError, match=r"'warp' needs .*: pip install 'cref-jax\[warp\]'"
     ):
         Physics(config.Robot(), ONE_SUBSTEP, "warp")
 

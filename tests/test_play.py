@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from cref_jax import learn, play, robot, runs, scene
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 from cref_jax.play import Options, Recording
 
 

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from cref_jax import processes
+from cref_jax.system import parallel
 
 SLEEPERS = """
 import functools, time
@@ -25,7 +25,7 @@ with cli.one_line_errors():
 def test_results_are_in_the_order_of_the_jobs(count):
     # the worker is pow(2, job)
     make = functools.partial(functools.partial, operator.pow)
-    assert processes.run(make, (2,), [5, 1, 3], count) == [32, 2, 8]
+    assert parallel.run(make, (2,), [5, 1, 3], count) == [32, 2, 8]
 
 
 @pytest.mark.parametrize("seconds", [0.5, 6.0])  # while the workers start, and at their work

@@ -14,7 +14,8 @@ from PIL import Image
 from reading import leaves, read
 
 from cref_jax import config, curves, exported, learning_charts, report, run_page, runs
-from cref_jax.config import Config, ConfigError
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
 
 ORIGIN = {
     "time": "2026-01-02T03:04:05+00:00",

@@ -7,7 +7,7 @@ import jax
 import pytest
 
 from cref_jax import runs
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 
 GIB = 2**30
 

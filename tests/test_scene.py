@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cref_jax import config, lanes, robot, scene, terrain
-from cref_jax.config import ConfigError
+from cref_jax.errors import ConfigError
 from cref_jax.physics import Body, Physics
 
 BOXED = [("flat", 0.0), ("stairs_up", 0.2), ("stairs_down", 0.05), ("gap", 0.75), ("platform", 0.4)]

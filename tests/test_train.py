@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cref_jax import config, export, exported, learn, runs, train
-from cref_jax.checkpoint import Checkpoints
+from cref_jax.training.checkpoint import Checkpoints
 
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
 TINY += ["--no-tensorboard", "--no-evaluate"]

@@ -28,19 +28,12 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from cref_jax import leaves
+from cref_jax.errors import CheckpointError, DamagedCheckpoint
 
 LOG = logging.getLogger(__name__)
 SCHEMA = 1  # one more whenever this program would misread a step of the next one
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "numpy")
 LEFTOVER = re.compile(r"\d+\.(new|old)(\.orbax-checkpoint-tmp.*)?")
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint that cannot be written or read; the message is one line that says which."""
-
-
-class DamagedCheckpoint(CheckpointError):
-    """The files of this step are not what was written; an older step may still be good."""
 
 
 class Loaded(NamedTuple):

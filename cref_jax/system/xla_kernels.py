@@ -18,7 +18,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def apart(function: Callable[P, R]) -> Callable[P, R]:
+def as_own_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function as one whose arguments and results are in memory, on a CPU.
 
     It computes the same. An accelerator has its own way to divide a program into kernels.
@@ -33,7 +33,7 @@ def apart(function: Callable[P, R]) -> Callable[P, R]:
     return called
 
 
-def stored(values: PyTree) -> PyTree:
+def materialize(values: PyTree) -> PyTree:
     """Return values that an accelerator has in memory before anything reads them.
 
     XLA for a GPU would compute them within the kernel that reads them, and where that one turns

@@ -5,21 +5,10 @@ what the paper does not say, so that `grep -rn "assumed:" cref_jax` is the compl
 Defaults are the paper's. A run changes them by a TOML file of differences or on the command line.
 """
 
-import dataclasses
-import difflib
-import tomllib
-import types
-import typing
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
-C = TypeVar("C")
 Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind"]
-
-
-class ConfigError(ValueError):
-    """A setting that cannot be used; the message is one line that says what would be right."""
 
 
 @dataclass(frozen=True)
@@ -324,74 +313,3 @@ class Config:
     foothold: Foothold = field(default_factory=Foothold)
     network: Network = field(default_factory=Network)
     ppo: PPO = field(default_factory=PPO)
-
-
-def override(config: C, changes: dict[str, Any], where: str = "") -> C:
-    """Return `config` with the nested `changes` applied.
-
-    Raises:
-        ConfigError: a key that does not exist (the nearest one is named), or a bad value.
-    """
-    hints = typing.get_type_hints(type(config))
-    values: dict[str, Any] = {}
-    for key, value in changes.items():
-        path = f"{where}{key}"
-        if key not in hints:
-            raise ConfigError(unknown("setting", key, list(hints), where))
-        if dataclasses.is_dataclass(hints[key]):
-            if not isinstance(value, dict):
-                raise ConfigError(f"'{path}' is a table of settings, not {value!r}")
-            values[key] = override(getattr(config, key), value, where=f"{path}.")
-        else:
-            values[key] = _checked(value, hints[key], path)
-    return dataclasses.replace(config, **values)  # type: ignore[type-var]
-
-
-def unknown(what: str, name: str, known: list[str], where: str = "") -> str:
-    """Return the message for a name that does not exist: the nearest one, or all that do.
-
-    `where` is what stands before the name, such as the tables that a setting is in.
-    """
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(known))}"
-    return f"unknown {what} '{where}{name}'; {hint}"
-
-
-def load_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises:
-        ConfigError: the file is missing or is not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"no file {path}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise ConfigError(f"{path}: {error}") from None
-
-
-def _checked(value: Any, hint: Any, path: str) -> Any:
-    """Return `value` as the type that the field declares, or say what would be right."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        inner = next(arg for arg in args if arg is not type(None))
-        return None if value is None else _checked(value, inner, path)
-    if origin is Literal:
-        if value not in args:
-            raise ConfigError(
-                f"'{path}' must be one of {', '.join(map(repr, args))}, not {value!r}"
-            )
-        return value
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"'{path}' must be a list, not {value!r}")
-        kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(kinds) != len(value):
-            raise ConfigError(f"'{path}' takes {len(kinds)} values, not {len(value)}")
-        return tuple(_checked(v, k, path) for v, k in zip(value, kinds, strict=True))
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if type(value) is not hint:
-        raise ConfigError(f"'{path}' must be {hint.__name__}, not {value!r}")
-    return value

@@ -1,0 +1,1 @@
+"""Collecting experience, learning from it, and what a run leaves on disk."""
