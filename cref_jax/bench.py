@@ -21,23 +21,12 @@ from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import (
-    brax_peer,
-    cli,
-    config,
-    lanes,
-    learn,
-    limits,
-    peers,
-    rollout,
-    roofline,
-    runs,
-    stages,
-)
-from cref_jax.config import Config
+from cref_jax import brax_peer, cli, config, learn, peers, rollout, roofline, runs, stages
+from cref_jax.config import Config, limits
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.roofline import Rates
 from cref_jax.system import jax_setup, parallel
+from cref_jax.terrain import lanes
 from cref_jax.world import World
 
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"

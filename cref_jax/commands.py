@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from rich.table import Table
 
-from cref_jax import evaluation, geometry, lanes, ppo, rollout, trials
+from cref_jax import evaluation, geometry, ppo, rollout, trials
 from cref_jax.config import Config
 from cref_jax.physics import Physics
+from cref_jax.terrain import lanes
 from cref_jax.world import World, make_world
 
 SECONDS = 10.0  # of a trial; assumed

@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from cref_jax import config, geometry, kinematics, march, robot, terrain
-from cref_jax.kinematics import Links
+from cref_jax import config, geometry, march, robot, terrain
+from cref_jax.robot import kinematics
+from cref_jax.robot.kinematics import Links
 from cref_jax.terrain import Terrain
 
 _ALONG = 1e-6  # columns/m, no ray is more nearly parallel to the border of a column

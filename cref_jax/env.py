@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 from cref_jax import config, depth, episode, foothold, gait, geometry, observation, reward, terrain
 from cref_jax.episode import Ending, EnvState
 from cref_jax.foothold import Soles
-from cref_jax.kinematics import Links
 from cref_jax.observation import Observation
 from cref_jax.physics import Body
+from cref_jax.robot.kinematics import Links
 from cref_jax.world import World
 
 FAR = 1.0  # m, of a foothold, for the critic; assumed: beyond, the reward is nothing

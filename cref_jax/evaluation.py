@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import lanes, ppo, rollout, shapes, sideways, trials
+from cref_jax import ppo, rollout, sideways, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
 from cref_jax.physics import Physics
+from cref_jax.terrain import generators, lanes
 from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
@@ -62,7 +63,7 @@ class Crossing(NamedTuple):
         """Return the outcome in one line for people."""
         causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
         return (
-            f"{self.kind} {shapes.extent(self.kind, self.size_m)}: {self.successes} of "
+            f"{self.kind} {generators.extent(self.kind, self.size_m)}: {self.successes} of "
             f"{self.trials} trials crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
             + (f"; failures: {causes}" if causes else "")
         )

@@ -9,10 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cref_jax import evaluation_tables, outcomes, page, shapes
+from cref_jax import evaluation_tables, outcomes, page
 from cref_jax.errors import ConfigError
 from cref_jax.outcomes import Failures, Line, Share, called
 from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
+from cref_jax.terrain import generators
 
 Record = Mapping[str, Any]
 Number = int | float  # JSON has both for one thing
@@ -319,7 +320,7 @@ def _called(scene: Record) -> str:
 
 def _size(cell: Record) -> str:
     size = cell.get("size_m")
-    return MISSING if size is None else shapes.extent(str(cell.get("kind")), size)
+    return MISSING if size is None else generators.extent(str(cell.get("kind")), size)
 
 
 def _paper(rate: Number, theirs: Number | None) -> str:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cref_jax import config, deploy, learn, learner, leaves, ppo, robot, runs, vectors
-from cref_jax.config import Config
+from cref_jax.config import Config, folders
 from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
 from cref_jax.world import World
@@ -91,7 +91,7 @@ def chosen(run: Path | None, policy: Path | None) -> Path:
 
 def bundled() -> Path:
     """Return the policy that comes with the package."""
-    return runs.data_folder("policies") / BUNDLED
+    return folders.data_folder("policies") / BUNDLED
 
 
 def is_run(path: Path) -> bool:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from cref_jax import config, geometry, kinematics, terrain
-from cref_jax.kinematics import Links
-from cref_jax.robot import Robot
+from cref_jax import config, geometry, terrain
+from cref_jax.robot import Robot, kinematics
+from cref_jax.robot.kinematics import Links
 from cref_jax.terrain import Terrain
 
 _PASSES = 3  # of the eigenvalue's iteration; one is exact for a plane, three for float32

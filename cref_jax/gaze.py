@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from cref_jax import depth, kinematics
+from cref_jax import depth
 from cref_jax.config import Camera, Config
 from cref_jax.episode import EnvState
+from cref_jax.robot import kinematics
 from cref_jax.world import World
 
 EDGE = 0.03  # m off the plane of the neighbours; assumed: above rounding and a slope's columns

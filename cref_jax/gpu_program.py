@@ -25,10 +25,11 @@ from jaxtyping import PyTree
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, depth, hlo, lanes, learn, limits, runs
-from cref_jax.config import Config
+from cref_jax import cli, depth, hlo, learn, runs
+from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
 from cref_jax.physics import Backend, Body, Physics
+from cref_jax.terrain import lanes
 from cref_jax.world import World
 
 LAUNCH = 3e-6  # s; assumed: the least time of a kernel, its launch included

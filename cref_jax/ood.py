@@ -18,7 +18,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from cref_jax import config, lanes, scene
+from cref_jax import config, geoms
+from cref_jax.config import folders
 from cref_jax.errors import ConfigError
 
 BORDER = 4.0  # m of floor around the path; assumed: further than the camera sees
@@ -65,7 +66,7 @@ class Scene(NamedTuple):
 
     def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
         """Add floor and solids to a model."""
-        scene.add_checker(spec, FLOOR, scene.TONES, repeat=0.5 / scene.TILE)
+        geoms.add_checker(spec, FLOOR, geoms.TONES, repeat=0.5 / geoms.TILE)
         for part in self._floor():
             _add(spec, part, friction).material = FLOOR
         for part in self.solids:
@@ -141,7 +142,7 @@ class _Part:
 
 def directory() -> Path:
     """Return where the scenes are."""
-    return lanes.directory() / "ood"
+    return folders.data_folder("terrains") / "ood"
 
 
 def scenes() -> dict[str, Scene]:
@@ -198,7 +199,7 @@ def _add(spec: mujoco.MjSpec, solid: Solid, friction: float) -> mujoco.MjsGeom:
         friction=[friction, 0.005, 0.0001],
         contype=0,
         conaffinity=1,
-        group=scene.GROUND,
+        group=geoms.GROUND,
     )
 
 

@@ -17,17 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
-from cref_jax import (
-    deploy,
-    evaluation,
-    exported,
-    ood,
-    ood_verdict,
-    robot,
-    scene,
-    sideways,
-    stand_in,
-)
+from cref_jax import deploy, evaluation, exported, ood, ood_verdict, robot, sideways, stand_in
 from cref_jax.config import Config
 from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.errors import ConfigError
@@ -35,6 +25,7 @@ from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
 from cref_jax.film import write_video
 from cref_jax.ood import Scene
 from cref_jax.ood_verdict import Condition, Outcome, Verdict
+from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import StandIn, Start, Trial
 from cref_jax.system import parallel
 
@@ -133,11 +124,11 @@ def film(
     runner = _Runner(policy or exported.bundled(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
     physics = runner.config.physics
-    spec = scene.stage("all", physics, -ood.DITCH - scene.BASE)
+    spec = robot_scene.stage("all", physics, -ood.DITCH - robot_scene.BASE)
     ground.add_to(spec, friction)
     stride = max(1, round(1.0 / (FRAME_RATE * physics.control_period)))
-    points = scene.camera_path(trial.qpos, physics.control_period)
-    with scene.Canvas(spec.compile(), *SIZE, *VIEW) as canvas:
+    points = robot_scene.camera_path(trial.qpos, physics.control_period)
+    with robot_scene.Canvas(spec.compile(), *SIZE, *VIEW) as canvas:
         moments = track(range(0, len(trial.qpos), stride), "drawing", transient=True)
         frames = (canvas.draw(trial.qpos[t], points[t]) for t in moments)
         write_video(out, frames, 1.0 / (stride * physics.control_period))

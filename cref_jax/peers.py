@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco.batch import Batch
 
-from cref_jax import config, depth, robot, scene
+from cref_jax import config, depth, geoms, robot
 from cref_jax.physics import Body, Physics
+from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import Lane
 from cref_jax.terrain import Terrain
 
@@ -53,7 +54,7 @@ def compare(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Sp
     if is_profile:
         seconds, images = _ours(ground, position, rotation, camera, is_profile=True)
         found.append(_speed("sweep of the profile", seconds, "all", images, reference))
-    heights, origin = scene.window(ground)
+    heights, origin = robot_scene.window(ground)
     some = slice(0, RAY_CAST)
     lane = Lane(heights, origin, ground.cell, np.inf)
     seconds, images = _multi_ray(lane, position[some], rotation[some], camera)
@@ -85,9 +86,9 @@ def box_mesh(
     heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
 ) -> Mesh:
     """Return a box for each rectangle of columns of one height: vertical risers, few triangles."""
-    boxes = scene.boxes(heights, TILE, most=heights.size)
+    boxes = geoms.boxes(heights, TILE, most=heights.size)
     assert boxes is not None
-    low = float(heights.min()) - scene.BASE
+    low = float(heights.min()) - robot_scene.BASE
     sides = np.array(
         [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
     )
@@ -118,7 +119,7 @@ def _poses(
 ) -> tuple[Float[np.ndarray, "E 3"], Float[np.ndarray, "E 3 3"]]:
     """Return cameras all along the lane that look as they do on the robot, and a little askew."""
     rng = np.random.default_rng(0)
-    heights, origin = scene.window(ground)
+    heights, origin = robot_scene.window(ground)
     x = origin[0] + rng.uniform(0.05, 0.75, CAMERAS) * heights.shape[0] * ground.cell
     columns = ((x - origin[0]) / ground.cell).astype(int)
     z = heights[columns, heights.shape[1] // 2] + rng.uniform(*HEIGHT, CAMERAS)

@@ -14,9 +14,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from cref_jax import config, geometry, kinematics, robot, terrain
+from cref_jax import config, geometry, robot, terrain
 from cref_jax.device_physics import MjxEngine, WarpEngine
 from cref_jax.host_physics import Dynamics, HostEngine, Substep
+from cref_jax.robot import kinematics
 
 MAX_DEPTH = 0.05  # m; a foot that swings at 8 m/s is 4 cm in a wall after one substep
 Backend = Literal["mjx", "mujoco", "warp"]

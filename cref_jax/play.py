@@ -28,19 +28,19 @@ from cref_jax import (
     exported,
     film,
     foothold,
-    lanes,
     network,
     panel,
     ppo,
     robot,
     rollout,
     runs,
-    scene,
 )
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
-from cref_jax.lanes import Atlas
+from cref_jax.rendering import robot_scene
 from cref_jax.system import jax_setup
+from cref_jax.terrain import lanes
+from cref_jax.terrain.atlas import Atlas
 from cref_jax.world import World
 
 T = TypeVar("T")
@@ -147,8 +147,8 @@ def play(options: Options) -> None:
     world = _world(options, c)
     train = exported.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
-    model = scene.build(robot.moving(c.robot), c.physics, world.lanes.tile(0, 0))
-    with scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
+    model = robot_scene.build(robot.moving(c.robot), c.physics, world.lanes.tile(0, 0))
+    with robot_scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
         recording = record(world, train, options)
         if options.stills:
             moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
@@ -283,11 +283,11 @@ def _lane(c: config.Terrain, options: Options) -> Atlas:
 
 
 def _film(
-    canvas: scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], c: Config
-) -> Iterator[scene.Frame]:
+    canvas: robot_scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], c: Config
+) -> Iterator[robot_scene.Frame]:
     """Yield the pictures of the robot after so many control steps, the panel beside it."""
     period = c.physics.control_period
-    points = scene.camera_path(recording.qpos, period)
+    points = robot_scene.camera_path(recording.qpos, period)
     for t in _tracked(moments, "drawing"):
         world = canvas.draw(recording.qpos[t], points[t], recording.marks[t])
         minds = recording.minds

@@ -22,7 +22,7 @@ import jax
 from jax.sharding import Mesh
 
 from cref_jax import config, learn, ppo
-from cref_jax.config import Config
+from cref_jax.config import Config, folders
 from cref_jax.errors import ConfigError
 from cref_jax.physics import EngineName, Physics, resolve_engine
 from cref_jax.training.checkpoint import Checkpoints
@@ -95,12 +95,6 @@ def versions() -> dict[str, str]:
     """Return the versions of the packages that a result may depend on."""
     packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     return {name: importlib.metadata.version(name) for name in packages}
-
-
-def data_folder(name: str) -> Path:
-    """Return `experiments`, `policies` or `terrains`: inside an installed package, or beside it."""
-    inside = Path(__file__).parent / name
-    return inside if inside.is_dir() else Path(__file__).parents[1] / name
 
 
 def read_config(run: Path) -> Config:
@@ -216,7 +210,7 @@ def _experiment(name: str) -> Path:
     """Return the file of an experiment, given by its name or as a path."""
     if name.endswith(".toml"):
         return Path(name)
-    folder = data_folder("experiments")
+    folder = folders.data_folder("experiments")
     known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "presets")
     if name not in (*known, "presets"):
         raise ConfigError(config.unknown("experiment", name, known))

@@ -14,12 +14,13 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, deploy, evaluation, exported, film, runs, scene, stand_in, transfer
+from cref_jax import cli, deploy, evaluation, exported, film, runs, stand_in, transfer
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.physics import Physics
+from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.system import jax_setup, parallel
@@ -151,7 +152,7 @@ class _Walker:
 def lane_of(world: World, level: int = 0) -> Lane:
     """Return a lane of a world that has one kind."""
     ground = world.lanes.tile(level, 0)
-    heights, origin = scene.window(ground)
+    heights, origin = robot_scene.window(ground)
     return Lane(heights, origin, ground.cell, world.lanes.end - world.config.episode.lane_end)
 
 
@@ -182,9 +183,11 @@ def _film(out: Path, world: World, trial: Trial) -> None:
     """Write what the robot did as a film."""
     c, period = world.config, world.config.physics.control_period
     stride = max(1, round(1.0 / (FRAME_RATE * period)))
-    points = scene.camera_path(trial.qpos, period)
+    points = robot_scene.camera_path(trial.qpos, period)
     moments = range(0, len(trial.qpos), stride)
-    with scene.Canvas(scene.build("all", c.physics, world.lanes.tile(0, 0)), *SIZE) as canvas:
+    with robot_scene.Canvas(
+        robot_scene.build("all", c.physics, world.lanes.tile(0, 0)), *SIZE
+    ) as canvas:
         frames = (canvas.draw(trial.qpos[t], points[t]) for t in track(moments, "drawing"))
         film.write_video(out, frames, 1.0 / (stride * period))
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from cref_jax import config, robot, scene, stall
+from cref_jax import config, geoms, robot, stall
 from cref_jax.config import Config
 from cref_jax.deploy import Policy, Status
 from cref_jax.disturbance import UNDISTURBED, Channel, Disturbance
@@ -76,7 +76,7 @@ class Lane(NamedTuple):
         around = math.ceil(MARGIN / self.cell)
         heights = np.pad(self.heights, around, mode="edge")
         origin = self.origin - around * self.cell
-        found = scene.boxes(heights, max(heights.shape), MOST_BOXES)
+        found = geoms.boxes(heights, max(heights.shape), MOST_BOXES)
         if found is None:
             raise ConfigError(f"this ground needs more than {MOST_BOXES} boxes")
         bottom = float(self.heights.min()) - 0.1  # m

@@ -16,8 +16,8 @@ import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, errors, evaluation, exported, learn, learner, limits, runs
-from cref_jax.config import Config
+from cref_jax import cli, errors, evaluation, exported, learn, learner, runs
+from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
 from cref_jax.physics import EngineName, resolve_engine
 from cref_jax.progress import Reporter

@@ -20,26 +20,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from rich.progress import Progress
 
-from cref_jax import (
-    config,
-    evaluation,
-    exported,
-    lanes,
-    network,
-    ppo,
-    profile,
-    rollout,
-    runs,
-    scene,
-    trials,
-)
+from cref_jax import config, evaluation, exported, network, ppo, rollout, runs, trials
 from cref_jax.config import Config
 from cref_jax.env import Outcome
 from cref_jax.errors import ConfigError
-from cref_jax.lanes import Atlas
 from cref_jax.physics import EngineName
+from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
-from cref_jax.terrain import Terrain
+from cref_jax.terrain import Terrain, cross_section, lanes
+from cref_jax.terrain.atlas import Atlas
 from cref_jax.world import World, make_world
 
 CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
@@ -240,11 +229,11 @@ def _on_lane(
 ) -> Shaped[np.ndarray, "*n"]:
     """Return the kind of ground of robots that are all on this lane."""
     if kind in STAIRS:
-        shape = profile.of_lane(ground)
-        way = profile.flight_at(shape, x)
-        way = np.where(way == 0, profile.flight_at(shape, x + before), way)
+        shape = cross_section.of_lane(ground)
+        way = cross_section.flight_at(shape, x)
+        way = np.where(way == 0, cross_section.flight_at(shape, x + before), way)
         return np.array(["", "stairs up", "stairs down"])[way]
-    heights, _ = scene.window(ground)
+    heights, _ = robot_scene.window(ground)
     uneven = ground.cell * np.flatnonzero(heights.any(axis=1))
     if not uneven.size:
         return np.full(x.shape, kind)

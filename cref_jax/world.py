@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from cref_jax import lanes, terrain
+from cref_jax import terrain
 from cref_jax.config import Config
-from cref_jax.lanes import Atlas
 from cref_jax.physics import Body, Physics
+from cref_jax.terrain import lanes
+from cref_jax.terrain.atlas import Atlas
 
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array

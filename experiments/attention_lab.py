@@ -37,10 +37,11 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from cref_jax import cli, gaze, profile, watch
+from cref_jax import cli, gaze, watch
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.system import jax_setup
+from cref_jax.terrain import cross_section
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -242,7 +243,7 @@ def strip(
     place = int(np.argmax(far))
     mine = np.flatnonzero(frames.robot == followed[place])
     _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
-    steps = profile.edges(profile.of_lane(world.lanes.tile(levels[followed[place]], k)))
+    steps = cross_section.edges(cross_section.of_lane(world.lanes.tile(levels[followed[place]], k)))
     edge = float(steps[0]) if steps.size else 2.0
     heads = frames.attention.shape[1]
     axes = figure.subplots(2 + heads, len(MOMENTS), squeeze=False)

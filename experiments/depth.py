@@ -15,7 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from cref_jax import config, depth, kinematics, lanes, robot, terrain
+from cref_jax import config, depth, robot, terrain
+from cref_jax.robot import kinematics
+from cref_jax.terrain import lanes
 
 BEFORE = 0.6  # m, from the pelvis to the first column that is not at z = 0
 LEVEL = 5  # of 0 to 9

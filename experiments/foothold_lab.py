@@ -41,9 +41,11 @@ import tyro
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, exported, foothold, kinematics, lanes, profile, terrain, watch
+from cref_jax import cli, evaluation, exported, foothold, terrain, watch
 from cref_jax.errors import ConfigError
+from cref_jax.robot import kinematics
 from cref_jax.system import jax_setup
+from cref_jax.terrain import cross_section, lanes
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -56,7 +58,7 @@ FACING = -0.7  # x of a riser's normal, at most: within 45 degrees of -x
 BIN = 0.01  # m
 PAPER = {"ours": 1.4, "FCQR": 2.8, "NoFR": 9.8}  # cm, MAD in descent, Sec. III-B
 NONE = "no touchdown"
-WAYS = {profile.UP: "ascent", profile.DOWN: "descent"}
+WAYS = {cross_section.UP: "ascent", cross_section.DOWN: "descent"}
 COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm", "d_xz_cm")
 
 
@@ -139,7 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
         for label, ways in found.items():
             for way, name in WAYS.items():
                 print(f"{label}, {name}: {ways[way].line()}")
-            print(f"{label}, ascent: {ways[profile.UP].collisions()}")
+            print(f"{label}, ascent: {ways[cross_section.UP].collisions()}")
             if not any(len(ways[way].position) for way in WAYS):
                 print(f"{label}: no touchdown on these stairs, so nothing to draw")
         watch.write_table(out.with_suffix(".csv"), COLUMNS, rows(found))
@@ -217,8 +219,8 @@ def summed(world: World, watched: Watched) -> dict[int, Way]:
     lane, levels = watch.in_turn(world.lanes, alive.shape[1])
     onto, over = np.zeros_like(alive), np.zeros_like(alive)
     for e, (kind, level) in enumerate(zip(lane, levels, strict=True)):
-        stairs, mine = profile.of_lane(world.lanes.tile(level, kind)), robot == e
-        place = profile.landed(stairs, sole[mine, 0], sole[mine, 2], REACH, TILT)
+        stairs, mine = cross_section.of_lane(world.lanes.tile(level, kind)), robot == e
+        place = cross_section.place_on_treads(stairs, sole[mine, 0], sole[mine, 2], REACH, TILT)
         flight[mine], position[mine] = place.flight, place.position
         treads, x = np.flatnonzero(stairs.flight), seen.base_x[:, e]
         onto[:, e] = alive[:, e] & (x > stairs.left[treads[0]])
@@ -312,7 +314,7 @@ def deviations(axis: Axes, found: dict[str, dict[int, Way]]) -> None:
     """Draw the deviation in descent of each policy, under those that the paper gives."""
     bars = [(f"paper: {name}", value, "", "0.7") for name, value in PAPER.items()]
     for row, (label, ways) in enumerate(found.items()):
-        x = ways[profile.DOWN].position
+        x = ways[cross_section.DOWN].position
         value = 100 * deviation(x) if len(x) else 0.0
         bars.append((label, value, f", n = {len(x)}" if len(x) else NONE, f"C{row}"))
     for y, (_, value, note, colour) in enumerate(bars):

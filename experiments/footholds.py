@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 from matplotlib.axes import Axes
 
-from cref_jax import config, foothold, lanes, terrain
+from cref_jax import config, foothold, terrain
+from cref_jax.terrain import lanes
 
 SIZES = {"stairs_up": 0.15, "stairs_down": 0.15, "gap": 0.5, "slope": 0.3}  # m; m/m for the slope
 BEFORE = 0.2  # m from the sole's centre to the obstacle

@@ -30,11 +30,11 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from matplotlib.axes import Axes
 
-from cref_jax import cli, profile, watch
+from cref_jax import cli, watch
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.system import jax_setup
-from cref_jax.terrain import Terrain
+from cref_jax.terrain import Terrain, cross_section
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -274,7 +274,7 @@ def draw_ground(
     x: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, " t"]:
     """Draw and return the height of the ground under the pelvis over time, m."""
-    heights = profile.along(ground)
+    heights = cross_section.middle_heights(ground)
     under = heights[np.clip((x / ground.cell).astype(int), 0, len(heights) - 1)]
     floor = min(float(under.min()), 0.0) - 0.1
     axis.fill_between(time, floor, under, step="post", color="0.75", lw=0)

@@ -7,8 +7,9 @@ depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import config, film, ood, robot, scene, stand_in
+from cref_jax import config, film, ood, robot, stand_in
 from cref_jax.config import Config
+from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import StandIn
 
 # isort: split
@@ -90,9 +91,9 @@ def view(c: Config, ground: ood.Scene, x: float) -> tuple[film.Frame, np.ndarray
     state.qpos[2] = body.robot.standing_height + under_soles(body, state) + 0.002
     mujoco.mj_forward(body.model, state)
     seen = body.image(state)
-    spec = scene.stage("all", c.physics, -ood.DITCH - scene.BASE)
+    spec = robot_scene.stage("all", c.physics, -ood.DITCH - robot_scene.BASE)
     ground.add_to(spec, robot.FRICTION)
-    with scene.Canvas(spec.compile(), *SIZE, *VIEWS.get(ground.name, VIEW)) as canvas:
+    with robot_scene.Canvas(spec.compile(), *SIZE, *VIEWS.get(ground.name, VIEW)) as canvas:
         picture = canvas.draw(state.qpos, state.qpos[:3] + AHEAD)
     return picture, np.where(np.isfinite(seen), np.minimum(seen, c.camera.d_max), c.camera.d_max)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from cref_jax import config, limits
-from cref_jax.config import Config
+from cref_jax import config
+from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
 
 SOURCE = Path(config.__file__).read_text()

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from cref_jax import config, depth, kinematics, lanes, robot, terrain
+from cref_jax import config, depth, robot, terrain
+from cref_jax.robot import kinematics
+from cref_jax.terrain import lanes
 
 CAMERA = config.Camera()
 HEIGHT, WIDTH = CAMERA.shape

@@ -7,8 +7,9 @@ import pytest
 import sample
 from sample import ROBOTS, C, assert_equal, on, one, put
 
-from cref_jax import config, episode, geometry, kinematics, terrain
+from cref_jax import config, episode, geometry, terrain
 from cref_jax.episode import Ending
+from cref_jax.robot import kinematics
 
 LENGTH = C.terrain.lane_length
 PERIOD = C.physics.control_period

@@ -10,6 +10,7 @@ from random_policy import ROBOT, SMALL, J, policy, recorded
 
 from cref_jax import config, deploy, exported, robot, vectors
 from cref_jax.errors import ConfigError
+from cref_jax.robot import x2_ultra
 
 
 @pytest.fixture
@@ -87,7 +88,7 @@ def test_the_manifest_says_what_the_engineer_needs():
     assert held == set(whole.joint_names) - set(ROBOT.joint_names)
     assert sum(term["size"] for term in manifest["observation"]["terms"]) == 9 + 3 * J
     assert len(manifest["observation"]["mean"]) == 9 + 3 * J
-    assert manifest["depth"]["mount"]["link"] in robot.XML.read_text()
+    assert manifest["depth"]["mount"]["link"] in x2_ultra.XML.read_text()
     assert manifest["rates"] == {"control_hz": 50.0, "depth_hz": 20.0, "frame_age_s": 0.02}
     json.dumps(manifest, allow_nan=False)
 

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cref_jax import config, foothold, geometry, kinematics, lanes, robot, terrain
+from cref_jax import config, foothold, geometry, robot, terrain
+from cref_jax.robot import kinematics
+from cref_jax.terrain import lanes
 
 C = config.Foothold()
 X = 0.12 + 0.04 * np.arange(25)  # m, means of the windows: 24 cm from 0 on, every 4 cm

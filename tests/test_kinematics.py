@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from cref_jax import config, kinematics, robot
+from cref_jax import config, robot
+from cref_jax.robot import kinematics
 
 STATES = 50
 

@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Int
 from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
-from cref_jax import cli, config, exported, gaze, lanes, profile, runs, watch
+from cref_jax import cli, config, exported, gaze, runs, watch
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
-from cref_jax.profile import DOWN, UP
+from cref_jax.terrain import atlas, cross_section, lanes
+from cref_jax.terrain.cross_section import DOWN, UP
 from cref_jax.watch import Moment, Watched
 from cref_jax.world import World
 
@@ -38,14 +39,18 @@ def lab(name: str) -> ModuleType:
 foothold_lab, gate_lab, attention_lab = map(lab, ("foothold_lab", "gate_lab", "attention_lab"))
 
 
-def steps_up_and_down() -> profile.Profile:
+def steps_up_and_down() -> cross_section.Profile:
     """Return level ground to 1 m, treads of 0.3 m at 0.2 and 0.4 m, 0.6 m at the top, and down."""
     heights = [(10, 0.0), (3, 0.2), (3, 0.4), (10, 0.6), (3, 0.4), (3, 0.2), (8, 0.0)]
-    return profile.of_heights(np.repeat([z for _, z in heights], [n for n, _ in heights]), CELL)
+    return cross_section.of_heights(
+        np.repeat([z for _, z in heights], [n for n, _ in heights]), CELL
+    )
 
 
 def landed(x, z):
-    found = profile.landed(steps_up_and_down(), np.array([x]), np.array([z]), 0.1, 0.05)
+    found = cross_section.place_on_treads(
+        steps_up_and_down(), np.array([x]), np.array([z]), 0.1, 0.05
+    )
     return float(found.position[0]), int(found.flight[0])
 
 
@@ -53,7 +58,7 @@ def test_a_tread_lies_between_risers_of_one_direction():
     p = steps_up_and_down()
     assert p.flight.tolist() == [0, UP, UP, 0, DOWN, DOWN, 0]
     np.testing.assert_allclose(p.left, [0.0, 1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
-    np.testing.assert_allclose(profile.edges(p), [1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
+    np.testing.assert_allclose(cross_section.edges(p), [1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
 
 
 @pytest.mark.parametrize(
@@ -79,13 +84,13 @@ def test_landings_risers_and_what_is_out_of_reach_are_no_treads(x, z):
 
 def test_the_flight_under_a_robot():
     x = np.array([[0.5, 1.1, 1.5, 2.0], [2.7, 3.1, 3.5, 99.0]])
-    assert profile.flight_at(steps_up_and_down(), x).tolist() == [
+    assert cross_section.flight_at(steps_up_and_down(), x).tolist() == [
         [0, UP, UP, 0],
         [DOWN, DOWN, 0, 0],
     ]
 
 
-def flights(rise: float) -> lanes.Atlas:
+def flights(rise: float) -> atlas.Atlas:
     """Return a lane with a flight up beside one with a flight down."""
     return lanes.grid(config.Terrain(), {"ascent": (rise,), "descent": (rise,)}, [1])
 
@@ -93,7 +98,7 @@ def flights(rise: float) -> lanes.Atlas:
 def test_the_stairs_have_the_tread_that_is_drawn():
     atlas = flights(0.20)
     for kind, way in enumerate((UP, DOWN)):
-        p = profile.of_lane(atlas.tile(0, kind))
+        p = cross_section.of_lane(atlas.tile(0, kind))
         treads = p.flight != 0
         assert set(p.flight[treads]) == {way}
         np.testing.assert_allclose((p.right - p.left)[treads], foothold_lab.TREAD, atol=1e-9)
@@ -119,7 +124,7 @@ def test_medium_lanes_have_the_medium_sizes_of_table_2():
 def test_what_a_robot_walks_on():
     # flat, and one gap lane whose first trench begins where its heights leave zero
     both = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.5,)}, [1])
-    edge = 0.02 * np.argmax(profile.along(both.tile(0, 1)) < 0)
+    edge = 0.02 * np.argmax(cross_section.middle_heights(both.tile(0, 1)) < 0)
     x = np.array([[1.0, edge - 0.6], [5.0, edge - 0.4], [9.0, edge + 0.2]])
     names = watch.terrain_under(both, x).tolist()
     assert names == [["flat", ""], ["flat", "gap"], ["flat", "gap"]]
@@ -150,7 +155,7 @@ def stairs_steps(touchdown, air_time, x, z, riser, distance):
 
 def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     atlas = flights(0.20)
-    p = profile.of_lane(atlas.tile(0, 0))
+    p = cross_section.of_lane(atlas.tile(0, 0))
     tread = int(np.flatnonzero(p.flight == UP)[0])
     x = np.full(5, p.left[tread] + 0.1)
     seen = stairs_steps(
@@ -184,7 +189,7 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
 
 def test_toes_touch_a_riser_once_they_are_at_it(world):
     world = world.replace(lanes=flights(0.20))
-    p = profile.of_lane(world.lanes.tile(0, 0))
+    p = cross_section.of_lane(world.lanes.tile(0, 0))
     state = jax.tree.map(lambda a: a[0], watch.begin(world, 0, 1).env)
     links = world.physics.links(state.body)
     balls = ROBOT.spheres

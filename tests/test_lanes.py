@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cref_jax import config, errors, lanes, terrain
+from cref_jax import config, errors, terrain
+from cref_jax.config import folders
 from cref_jax.errors import ConfigError
+from cref_jax.terrain import heightmap, lanes
 
 CELL = 0.02  # m
 TRAIN = {  # m, Table II where it has the kind
@@ -248,7 +250,9 @@ def test_evaluation_sizes_are_those_of_table_2():
     assert lanes.named_sizes(c, "rough") == {}
 
 
-@pytest.mark.parametrize("path", sorted(lanes.directory().glob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted(folders.data_folder("terrains").glob("*.toml")), ids=lambda p: p.stem
+)
 def test_every_terrain_file_builds(path):
     small = config.Terrain(name=path.stem, lane_width=1.0, levels=1)
     assert lanes.build(small).sizes[0, 0] == (TRAIN | FLIGHTS)[lanes.build(small).kinds[0]][0]
@@ -270,7 +274,7 @@ def test_a_height_map_becomes_one_lane_that_starts_at_z_zero(tmp_path):
     atlas = lanes.build(write_map(tmp_path, heights))
     assert (atlas.kinds, atlas.levels, atlas.terrain.size) == (("custom",), 1, (10, 6))
     # the start lies in column (5, 2); one metre of heights a row of 6 columns apart is 6 cm
-    start = jnp.array([lanes.MAP_START, 0.0])
+    start = jnp.array([heightmap.MAP_START, 0.0])
     found = terrain.height_at(atlas.tile(0, 0), start + jnp.array([[0.0, 0.0], [0.1, 0.0]]))
     np.testing.assert_allclose(found, [0.0, 0.06], atol=1e-6)
 
@@ -283,7 +287,7 @@ def test_a_picture_is_seen_from_above(tmp_path, bits):
     atlas = lanes.build(config.Terrain(name=str(tmp_path / "hill.png")))
     expected = [[0.0, 0.3], [0.1, 0.4], [0.2, 0.5]]
     np.testing.assert_allclose(atlas.tile(0, 0).heights, expected, atol=1e-6)
-    here = terrain.height_at(atlas.tile(0, 0), jnp.array([lanes.MAP_START, 0.1]))
+    here = terrain.height_at(atlas.tile(0, 0), jnp.array([heightmap.MAP_START, 0.1]))
     np.testing.assert_allclose(here, 0.3, atol=1e-6)
 
 

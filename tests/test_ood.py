@@ -6,12 +6,13 @@ import pytest
 import stepper
 from random_policy import ROBOT
 
-from cref_jax import config, deploy, evaluation, lanes, ood, robot, stand_in
+from cref_jax import config, deploy, evaluation, ood, robot, stand_in
 from cref_jax.config import Config
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Channel, Disturbance
 from cref_jax.errors import ConfigError
 from cref_jax.stand_in import StandIn, Start
+from cref_jax.terrain import lanes
 
 C = evaluation.evaluation_config(Config())
 SCENES = ood.scenes()

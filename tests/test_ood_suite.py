@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cref_jax import deploy, exported, ood, ood_suite, ood_verdict, scene
+from cref_jax import deploy, exported, ood, ood_suite, ood_verdict
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Disturbance
 from cref_jax.errors import ConfigError
 from cref_jax.ood_suite import CONDITIONS, GOOD
 from cref_jax.ood_verdict import Condition, Outcome
+from cref_jax.rendering import robot_scene
 from cref_jax.system import parallel
 
 FEW = {name: ood.named(name) for name in ("flagstones", "steel_grate")}
@@ -183,7 +184,7 @@ def test_a_trial_can_be_filmed(tmp_path, monkeypatch):
     monkeypatch.setattr(ood_suite, "TRIAL_SECONDS", 0.2)
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     try:
-        scene.Canvas(model, 8, 8).__exit__()
+        robot_scene.Canvas(model, 8, 8).__exit__()
     except ConfigError as error:
         pytest.skip(str(error))
     trial = ood_suite.film(None, "curbs", tmp_path / "film.mp4")

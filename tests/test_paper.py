@@ -2,8 +2,9 @@
 
 import pytest
 
-from cref_jax import lanes, paper, table
+from cref_jax import paper, table
 from cref_jax.config import Terrain
+from cref_jax.terrain import lanes
 
 
 def test_overall_is_the_plain_mean_of_the_twelve_cells():

@@ -16,9 +16,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from cref_jax import config, errors, geometry, kinematics, robot, terrain
+from cref_jax import config, errors, geometry, robot, terrain
 from cref_jax.host_physics import Dynamics
 from cref_jax.physics import Body, Physics, resolve_engine
+from cref_jax.robot import kinematics
 
 ROBOTS = 200
 CELL = 0.02  # m

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cref_jax import learn, play, robot, runs, scene
+from cref_jax import learn, play, robot, runs
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.play import Options, Recording
+from cref_jax.rendering import robot_scene
 
 
 @pytest.fixture
@@ -15,7 +16,7 @@ def opengl():
     """Skip where nothing can be drawn."""
     model = robot.spec("legs", Config().physics, contact_planes=0).compile()
     try:
-        with scene.Canvas(model, 16, 16):
+        with robot_scene.Canvas(model, 16, 16):
             pass
     except ConfigError as error:
         pytest.skip(str(error))

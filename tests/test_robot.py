@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cref_jax import config, robot
+from cref_jax.robot import x2_ultra
 
 FACTS = json.loads((Path(__file__).parent / "x2_facts.json").read_text())
 ACTUATED = ["legs", "legs+waist", "all"]
@@ -13,7 +14,7 @@ ACTUATED = ["legs", "legs+waist", "all"]
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(str(robot.XML))
+    return mujoco.MjModel.from_xml_path(str(x2_ultra.XML))
 
 
 def mean_of_sides(values: dict[str, float], name: str) -> float:

@@ -3,9 +3,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from cref_jax import config, lanes, robot, scene, terrain
+from cref_jax import config, geoms, robot, terrain
 from cref_jax.errors import ConfigError
 from cref_jax.physics import Body, Physics
+from cref_jax.rendering import robot_scene
+from cref_jax.terrain import lanes
 
 BOXED = [("flat", 0.0), ("stairs_up", 0.2), ("stairs_down", 0.05), ("gap", 0.75), ("platform", 0.4)]
 SMOOTH = [("slope", 0.2), ("rough", 0.06)]
@@ -31,7 +33,7 @@ def heights_seen(model, points):
 def test_the_boxes_cover_every_column_once_at_its_height(seed):
     rng = np.random.default_rng(seed)
     heights = rng.choice([0.0, 0.1, -1.0], (13, 9), p=[0.8, 0.1, 0.1]).astype(np.float32)
-    found = scene.boxes(heights, tile=4)
+    found = geoms.boxes(heights, tile=4)
     assert found is not None
     times, painted = np.zeros(heights.shape, int), np.full(heights.shape, np.nan)
     for (i, j), (along, across), height, _ in zip(*found, strict=True):
@@ -44,7 +46,7 @@ def test_the_boxes_cover_every_column_once_at_its_height(seed):
 def test_tones_take_turns_at_risers_and_tiles():
     # one row; a tile is 3 columns. Level: 3 + 2, a step: 2, a landing: 3 + 3 + 1
     profile = np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 2, 2], np.float32)
-    found = scene.boxes(profile[:, None], tile=3)
+    found = geoms.boxes(profile[:, None], tile=3)
     assert found is not None
     assert found.size[:, 0].tolist() == [3, 2, 2, 3, 3, 1]
     assert found.tone.tolist() == [0, 1, 0, 1, 0, 1]
@@ -52,15 +54,15 @@ def test_tones_take_turns_at_risers_and_tiles():
 
 @pytest.mark.parametrize(("kind", "size"), BOXED)
 def test_a_lane_of_level_pieces_takes_few_boxes(kind, size):
-    heights, _ = scene.window(lane(kind, size))
-    found = scene.boxes(heights, tile=50)
+    heights, _ = robot_scene.window(lane(kind, size))
+    found = geoms.boxes(heights, tile=50)
     assert found is not None
     assert len(found.tone) <= (50 if "stairs" in kind else 25)
 
 
 @pytest.mark.parametrize(("kind", "size"), SMOOTH)
 def test_a_slope_and_noise_become_a_height_field(kind, size):
-    model = scene.build("legs", config.Physics(), lane(kind, size))
+    model = robot_scene.build("legs", config.Physics(), lane(kind, size))
     assert (model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).sum() == 1
 
 
@@ -70,7 +72,7 @@ def test_the_boxes_show_the_ground_that_the_robot_feels(kind, size):
     rng = np.random.default_rng(0)
     columns = rng.integers(0, ground.size, (200, 2)) + rng.uniform(0.01, 0.99, (200, 2))
     points = np.asarray(ground.origin) + columns * ground.cell
-    seen = heights_seen(scene.build("legs", config.Physics(), ground), points)
+    seen = heights_seen(robot_scene.build("legs", config.Physics(), ground), points)
     np.testing.assert_allclose(seen, terrain.height_at(ground, points), atol=1e-5)
 
 
@@ -80,15 +82,15 @@ def test_the_field_goes_through_the_middles_of_the_columns(kind, size):
     columns = np.random.default_rng(0).integers(1, np.array(ground.size) - 1, (200, 2))
     # off the middle by a hair, since a ray through an edge of two triangles may meet neither
     points = np.asarray(ground.origin) + (columns + 0.5003) * ground.cell
-    seen = heights_seen(scene.build("legs", config.Physics(), ground), points)
+    seen = heights_seen(robot_scene.build("legs", config.Physics(), ground), points)
     np.testing.assert_allclose(seen, terrain.height_at(ground, points), atol=1e-4)
 
 
 def test_a_huge_map_is_thinned_out(monkeypatch):
-    monkeypatch.setattr(scene, "MOST_VERTICES", 100)
+    monkeypatch.setattr(robot_scene, "MOST_VERTICES", 100)
     x = np.arange(40) * 0.05
     ground = terrain.from_heights(np.sin(x)[:, None] + 0.1 * x, 0.05, (-0.3, 0.2))
-    model = scene.build("legs", config.Physics(), ground)
+    model = robot_scene.build("legs", config.Physics(), ground)
     assert model.hfield_nrow[0] * model.hfield_ncol[0] <= 100
     # every 4th column; column 20 has its middle at x = -0.3 + 20.5 * 0.05, y = 0.2 + 20.5 * 0.05
     seen = heights_seen(model, [(-0.3 + 20.503 * 0.05, 0.2 + 20.503 * 0.05)])
@@ -107,7 +109,7 @@ def test_the_links_are_drawn_where_the_physics_has_them(held):
     still = np.zeros(len(joints) + 6, np.float32)
     links = physics.links(Body(jnp.asarray(qpos), jnp.asarray(still), jnp.asarray(still)))
 
-    model = scene.build(robot.moving(c), config.Physics(), lane("flat", 0.0))
+    model = robot_scene.build(robot.moving(c), config.Physics(), lane("flat", 0.0))
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -120,26 +122,26 @@ def test_the_links_are_drawn_where_the_physics_has_them(held):
 def test_the_camera_keeps_up_with_a_steady_walk_and_ignores_the_bobbing():
     t = np.arange(200) * 0.04  # s
     steady = np.stack([0.6 * t, 0.0 * t, 0.6 + 0.1 * t], axis=1)
-    np.testing.assert_allclose(scene.camera_path(steady, 0.04), steady, atol=1e-9)
+    np.testing.assert_allclose(robot_scene.camera_path(steady, 0.04), steady, atol=1e-9)
     bobbing = steady + 0.03 * np.sin(2 * np.pi * 2.0 * t)[:, None]  # 2 steps/s
     middle = slice(20, -20)
-    error = scene.camera_path(bobbing, 0.04)[middle] - steady[middle]
+    error = robot_scene.camera_path(bobbing, 0.04)[middle] - steady[middle]
     assert np.abs(error).max() < 0.003
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_the_camera_follows_a_short_film(count):
     qpos = np.linspace(0.0, 1.0, count)[:, None] * np.ones(9)
-    np.testing.assert_allclose(scene.camera_path(qpos, 0.02), qpos[:, :3], atol=1e-9)
+    np.testing.assert_allclose(robot_scene.camera_path(qpos, 0.02), qpos[:, :3], atol=1e-9)
 
 
 def test_the_robot_stands_in_the_middle_of_the_picture():
     data = robot.load(config.Robot())
     moves = robot.moving(config.Robot())
-    model = scene.build(moves, config.Physics(), lane("stairs_up", 0.15))
+    model = robot_scene.build(moves, config.Physics(), lane("stairs_up", 0.15))
     qpos = np.concatenate([[0.75, 0, data.standing_height, 1, 0, 0, 0], data.rest_pose])
     try:
-        canvas = scene.Canvas(model, 192, 108)
+        canvas = robot_scene.Canvas(model, 192, 108)
     except ConfigError as error:
         pytest.skip(str(error))
     with canvas:

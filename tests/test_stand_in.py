@@ -8,10 +8,11 @@ import pytest
 from random_policy import ROBOT, contents, policy
 from sample import put
 
-from cref_jax import deploy, depth, env, episode, evaluation, scene, sim2sim, stand_in, terrain
+from cref_jax import deploy, depth, env, episode, evaluation, sim2sim, stand_in, terrain
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
 from cref_jax.physics import Body, Physics
+from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import Lane, StandIn, Start
 
 C = evaluation.evaluation_config(Config())
@@ -52,7 +53,7 @@ def gap_world():
 def test_it_sees_what_the_robot_sees_in_training():
     world = gap_world()
     body = on_lane(sim2sim.lane_of(world))
-    heights = scene.window(world.lanes.tile(0, 0))[0]
+    heights = robot_scene.window(world.lanes.tile(0, 0))[0]
     edge = 0.02 * int(np.argmin(heights[:, 100] > -0.5))  # m, where the first gap begins
     turned = np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)], np.float32)
     for x in (edge - 0.8, edge - 0.3):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from cref_jax.terrain import Terrain
+from cref_jax.terrain.column_grid import Terrain
 
 UP, DOWN = 1, -1  # directions of a flight
 
@@ -30,7 +30,7 @@ class Landed(NamedTuple):
     flight: Int[np.ndarray, " P"]  # UP, DOWN, or 0 for no tread
 
 
-def along(ground: Terrain) -> Float[np.ndarray, " X"]:
+def middle_heights(ground: Terrain) -> Float[np.ndarray, " X"]:
     """Return the heights along the middle of a lane, m."""
     return ground.heights[:, ground.size[1] // 2]
 
@@ -48,10 +48,10 @@ def of_heights(heights: Float[np.ndarray, " X"], cell: float) -> Profile:
 
 def of_lane(ground: Terrain) -> Profile:
     """Return the sections of a lane."""
-    return of_heights(along(ground), ground.cell)
+    return of_heights(middle_heights(ground), ground.cell)
 
 
-def landed(
+def place_on_treads(
     profile: Profile,
     x: Float[np.ndarray, " P"],
     z: Float[np.ndarray, " P"],

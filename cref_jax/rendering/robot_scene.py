@@ -5,23 +5,18 @@ motion shows: the tone changes with each tread and with each metre. Where too ma
 needed, as on a slope or on noise, a height field is drawn through the columns' middles instead.
 """
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from cref_jax import config, robot
+from cref_jax import config, geoms, robot
 from cref_jax.errors import ConfigError
 from cref_jax.film import Frame
+from cref_jax.geoms import GROUND, TILE, TONES, Boxes
 from cref_jax.terrain import Terrain
 
-GROUND = 0  # geom group of the lane and of the plain; the robot's shapes are in 2 and 3
-MOST_BOXES = 150  # beyond, a height field; stairs take some 40, a slope 200 and more
 MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU
-TILE = 1.0  # m, between two changes of tone
 BASE = 0.1  # m, from the plain to the lowest column
-TONES = ((0.80, 0.78, 0.74), (0.66, 0.65, 0.63))  # red, green, blue
 PLAIN = (0.66, 0.72, 0.78)
 SKY = ((0.30, 0.50, 0.75), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
 
@@ -36,20 +31,11 @@ VIEW = 32.0  # deg, vertical
 CALM = 1.0  # s of the pelvis's way that the camera averages over
 
 
-class Boxes(NamedTuple):
-    """Rectangles of columns of one height and tone, B of them."""
-
-    first: Int[np.ndarray, "B 2"]  # column
-    size: Int[np.ndarray, "B 2"]  # columns
-    height: Float[np.ndarray, " B"]  # m
-    tone: Int[np.ndarray, " B"]  # index into TONES
-
-
 def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) -> mujoco.MjModel:
     """Return the model to draw; its qpos is that of the physics, its x and y those of `ground`."""
     heights, origin = window(ground)
     spec = stage(actuated, physics, float(heights.min()) - BASE)
-    found = boxes(heights, max(1, round(TILE / ground.cell)))
+    found = geoms.boxes(heights, max(1, round(TILE / ground.cell)))
     if found is None:
         _add_field(spec, heights, origin, ground.cell)
     else:
@@ -65,49 +51,9 @@ def stage(actuated: robot.Actuated, physics: config.Physics, z: float) -> mujoco
     return spec
 
 
-def add_checker(
-    spec: mujoco.MjSpec, name: str, tones: tuple[tuple[float, ...], ...], repeat: float
-) -> None:
-    """Add a material with two fields of each tone a period, `repeat` periods a metre."""
-    spec.add_texture(
-        name=name,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=tones[0],
-        rgb2=tones[1],
-        width=256,
-        height=256,
-    )
-    textures = [""] * mujoco.mjtTextureRole.mjNTEXROLE
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    spec.add_material(name=name, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
-
-
 def window(ground: Terrain) -> tuple[Float[np.ndarray, "X Y"], Float[np.ndarray, "2"]]:
     """Return the heights of the columns in the terrain's window, and its outer corner, m."""
     return ground.heights, np.asarray(ground.origin)
-
-
-def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) -> Boxes | None:
-    """Return boxes that cover every column once, or None if more than `most` would be needed.
-
-    Greedy: from the first column that is left, as far as possible across, then along.
-    """
-    tone = _tones(heights, tile)
-    number = np.unique(heights, return_inverse=True)[1].reshape(heights.shape)
-    look = 2 * number + tone  # what a box has in common; -1: in a box already
-    found: list[tuple[tuple[int, int], tuple[int, int]]] = []
-    while (look >= 0).any():
-        if len(found) == most:
-            return None
-        i, j = (int(k) for k in np.unravel_index(np.argmax(look >= 0), look.shape))
-        across = _run(look[i, j:] == look[i, j])
-        along = _run((look[i:, j : j + across] == look[i, j]).all(axis=1))
-        look[i : i + along, j : j + across] = -1
-        found.append(((i, j), (along, across)))
-    first, size = (np.array(part, np.int32) for part in zip(*found, strict=True))
-    at = tuple(first.T)
-    return Boxes(first, size, heights[at], tone[at])
 
 
 class Canvas:
@@ -192,19 +138,6 @@ def camera_path(qpos: Float[np.ndarray, "T Q"], period: float) -> Float[np.ndarr
     return np.stack(averaged, axis=1)
 
 
-def _tones(heights: Float[np.ndarray, "X Y"], tile: int) -> Int[np.ndarray, "X Y"]:
-    """Return 0 or 1 for each column: along x they take turns at each riser and each `tile`."""
-    x = np.arange(heights.shape[0])[:, None]
-    risers = np.diff(heights, axis=0, prepend=heights[:1]) != 0.0
-    since = x - np.maximum.accumulate(np.where(risers, x, 0), axis=0)  # the last riser
-    return np.cumsum(risers | ((since > 0) & (since % tile == 0)), axis=0) % 2
-
-
-def _run(flags: Bool[np.ndarray, " n"]) -> int:
-    """Return how many flags are true before the first that is not."""
-    return len(flags) if flags.all() else int(np.argmin(flags))
-
-
 def _add_boxes(
     spec: mujoco.MjSpec, found: Boxes, origin: Float[np.ndarray, "2"], cell: float
 ) -> None:
@@ -241,7 +174,7 @@ def _add_field(
         size=[*(0.5 * extent), max(rise, 1e-3), BASE],
         userdata=((heights - low) / max(rise, 1e-3)).T.ravel(),
     )
-    add_checker(spec, "lane", TONES, repeat=0.5 / TILE)
+    geoms.add_checker(spec, "lane", TONES, repeat=0.5 / TILE)
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_HFIELD,
         hfieldname="lane",

@@ -1,11 +1,10 @@
 """The AGIBOT X2 Ultra as data, and the model to train on, derived from its MJCF.
 
-Masses, limits and gains stand in `assets/x2_ultra.xml` and are read off the compiled model; the
-nominal pose and the roles of joints and links stand here.
+Masses, limits and gains stand in `x2_ultra.xml` and are read off the compiled model; the
+nominal pose and the roles of joints and links stand in `x2_ultra.py`.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import mujoco
@@ -13,23 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cref_jax import config
+from cref_jax.robot import x2_ultra
+from cref_jax.robot.x2_ultra import IN_VIEW, KEPT_CLEAR, LEG_JOINTS, XML
 
-XML = Path(__file__).parent / "assets" / "x2_ultra.xml"
 Actuated = Literal["legs", "legs+waist", "all"]
 MOVING: dict[str, Actuated] = {"none": "legs", "waist": "legs+waist", "all": "all"}  # at least
-
-NOMINAL_POSE = {  # rad, both sides; a joint not named here is at 0. assumed: flat feet, and the
-    "hip_pitch": -0.42,  # pelvis at the 0.55 m above the ankles that Table I asks for
-    "knee": 0.83,
-    "ankle_pitch": -0.41,
-    "shoulder_pitch": 0.2,
-    "shoulder_roll": 0.2,  # outward
-    "elbow": -0.6,
-}
-LEG_JOINTS = ("hip", "knee", "ankle")
 FRICTION = 0.9  # of a contact sphere on the ground; assumed: rubber on a dry floor
-IN_VIEW = ("hip_yaw", "knee", "ankle_roll", "elbow", "wrist_yaw", "wrist_roll")  # of the camera
-KEPT_CLEAR = ("pelvis", "torso", "head_pitch", "hip_yaw")  # on the ground, the robot has fallen
 
 
 class Spheres(NamedTuple):
@@ -96,7 +84,7 @@ def load(c: config.Robot) -> Robot:
     """Return the robot with the joints of `c.actuated`, read off the model that moves."""
     model = spec(moving(c), config.Physics(), contact_planes=0, visual=True).compile()
     joints = range(1, model.njnt)  # joint 0 is the pelvis's freejoint
-    rest = np.array([nominal_angle(model.joint(j).name) for j in joints])
+    rest = np.array([x2_ultra.nominal_angle(model.joint(j).name) for j in joints])
     names = tuple(n for j in joints if _moves(n := model.joint(j).name, c.actuated))
     first = slice(len(names))  # legs, waist, arms, head: those that are held come last
     kp, effort = model.actuator_gainprm[first, 0], model.actuator_forcerange[first, 1]
@@ -187,14 +175,6 @@ def solve_sparsely(spec: mujoco.MjSpec) -> None:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
-def nominal_angle(joint: str) -> float:
-    """Return q0 of a joint by its name, rad; turns about x and z are mirrored on the right."""
-    side, _, kind = joint.removesuffix("_joint").partition("_")
-    mirrored = side == "right" and kind.endswith(("roll", "yaw"))
-    angle = NOMINAL_POSE.get(kind, 0.0)
-    return -angle if mirrored and angle else angle
-
-
 def _moves(joint: str, those: Actuated) -> bool:
     """Return whether the joint of this name is one of those."""
     parts = joint.split("_")
@@ -206,7 +186,7 @@ def _moves(joint: str, those: Actuated) -> bool:
 def _weld(s: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
     """Fix a hinge at its nominal angle: turn its body there, then take it and its motor away."""
     body, turn, turned = joint.parent, np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, joint.axis, nominal_angle(joint.name))
+    mujoco.mju_axisAngle2Quat(turn, joint.axis, x2_ultra.nominal_angle(joint.name))
     mujoco.mju_mulQuat(turned, body.quat, turn)
     body.quat = turned
     s.delete(s.actuator(joint.name))

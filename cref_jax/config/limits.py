@@ -1,6 +1,6 @@
 """Which settings can run: what is wrong is said before anything is compiled."""
 
-from cref_jax.config import Config
+from cref_jax.config.settings import Config
 from cref_jax.errors import ConfigError
 
 
