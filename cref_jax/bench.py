@@ -23,7 +23,8 @@ from rich.table import Table
 
 from cref_jax import brax_peer, cli, config, learn, peers, rollout, roofline, runs, stages
 from cref_jax.config import Config, limits
-from cref_jax.physics import EngineName, resolve_engine
+from cref_jax.physics.records import EngineName
+from cref_jax.physics.simulation import resolve_engine
 from cref_jax.roofline import Rates
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import lanes

@@ -24,7 +24,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cref_jax import config, env, episode
 from cref_jax.observation import Observation
-from cref_jax.physics import EngineName, Physics, resolve_engine
+from cref_jax.physics.records import EngineName
+from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.world import make_world
 
 with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from cref_jax import evaluation, geometry, ppo, rollout, trials
 from cref_jax.config import Config
-from cref_jax.physics import Physics
+from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.world import World, make_world
 

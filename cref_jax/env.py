@@ -15,7 +15,7 @@ from cref_jax import config, depth, episode, foothold, gait, geometry, observati
 from cref_jax.episode import Ending, EnvState
 from cref_jax.foothold import Soles
 from cref_jax.observation import Observation
-from cref_jax.physics import Body
+from cref_jax.physics.records import Body
 from cref_jax.robot.kinematics import Links
 from cref_jax.world import World
 

@@ -14,8 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from cref_jax import config, foothold, gait, geometry, stall
 from cref_jax.foothold import Candidates
 from cref_jax.gait import Gait
-from cref_jax.host_physics import Dynamics
-from cref_jax.physics import Body
+from cref_jax.physics.records import Body, Dynamics
 from cref_jax.robot.kinematics import Links
 from cref_jax.world import World
 

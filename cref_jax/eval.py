@@ -30,7 +30,7 @@ from cref_jax import (
     table,
 )
 from cref_jax.errors import ConfigError
-from cref_jax.physics import EngineName
+from cref_jax.physics.records import EngineName
 from cref_jax.system import jax_setup, parallel
 from cref_jax.world import World
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cref_jax import ppo, rollout, sideways, trials
 from cref_jax.config import Config
 from cref_jax.episode import Ending
-from cref_jax.physics import Physics
+from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import generators, lanes
 from cref_jax.world import World, make_world
 

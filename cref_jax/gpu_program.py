@@ -28,7 +28,8 @@ from rich.table import Table
 from cref_jax import cli, depth, hlo, learn, runs
 from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
-from cref_jax.physics import Backend, Body, Physics
+from cref_jax.physics.records import Backend, Body
+from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.world import World
 

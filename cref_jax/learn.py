@@ -18,7 +18,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, PyTree
 
 from cref_jax import mirror, ppo, ramp, rollout
-from cref_jax.losses import Losses
+from cref_jax.ppo import Losses
 from cref_jax.ramp import Ramp
 from cref_jax.world import World
 

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float, Float16, Int
 
 from cref_jax import config, network, observation
-from cref_jax.losses import Mirror
-from cref_jax.physics import Body
+from cref_jax.physics.records import Body
+from cref_jax.ppo import Mirror
 
 POLAR = np.array([1.0, -1.0, 1.0], np.float32)  # of a velocity, a force, a place
 AXIAL = np.array([-1.0, 1.0, -1.0], np.float32)  # of a rotation

@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int
 from mujoco.batch import Batch
 
 from cref_jax import config, depth, geoms, robot
-from cref_jax.physics import Body, Physics
+from cref_jax.physics.records import Body
+from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import Lane
 from cref_jax.terrain import Terrain

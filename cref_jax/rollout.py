@@ -14,10 +14,11 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, losses, network, ppo, readout
+from cref_jax import config, depth, env, episode, network, ppo
 from cref_jax.env import Outcome
 from cref_jax.episode import Ending, EnvState
 from cref_jax.observation import Observation
+from cref_jax.ppo import auxiliary
 from cref_jax.system import xla_kernels
 from cref_jax.world import World
 
@@ -62,12 +63,12 @@ class Networks(NamedTuple):
 
     actor: network.Actor
     critic: network.Critic
-    mirror: losses.Mirror | None = None  # the symmetry that the actor is taught, if any
+    mirror: ppo.Mirror | None = None  # the symmetry that the actor is taught, if any
 
     @property
-    def functions(self) -> losses.Networks:
+    def functions(self) -> ppo.Networks:
         """The same as functions of their parameters."""
-        return losses.Networks(self.actor.apply, self.critic.apply, self.mirror)
+        return ppo.Networks(self.actor.apply, self.critic.apply, self.mirror)
 
 
 class _Step(NamedTuple):
@@ -111,7 +112,7 @@ def networks(c: config.Network, num_actions: int) -> Networks:
 
 def initial_params(
     c: config.Config, num_actions: int, robots: Robots, key: PRNGKeyArray
-) -> losses.Params:
+) -> ppo.Params:
     """Return fresh parameters for observations of the robots' shapes."""
     key_actor, key_critic = jax.random.split(key)
     one = lambda x: x[None, :1]
@@ -124,10 +125,10 @@ def initial_params(
         key_actor, carry, one(seen.proprioception), begins, sight
     )
     shape = said.feature.shape[-1], c.scan.x[2] * c.scan.y[2]
-    return losses.Params(
+    return ppo.Params(
         actor=actor,
         critic=nets.critic.init(key_critic, one(seen.privileged)),
-        readout=readout.untaught(*shape) if c.ppo.readout_weight else None,
+        readout=auxiliary.initial_readout(*shape) if c.ppo.readout_weight else None,
     )
 
 

@@ -19,7 +19,7 @@ from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
-from cref_jax.physics import Physics
+from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial

@@ -19,7 +19,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from cref_jax import cli, errors, evaluation, exported, learn, learner, runs
 from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
-from cref_jax.physics import EngineName, resolve_engine
+from cref_jax.physics.records import EngineName
+from cref_jax.physics.simulation import resolve_engine
 from cref_jax.progress import Reporter
 from cref_jax.system import interrupts, jax_setup, parallel
 from cref_jax.training.checkpoint import Checkpoints, lock

@@ -24,7 +24,7 @@ from cref_jax import config, evaluation, exported, network, ppo, rollout, runs, 
 from cref_jax.config import Config
 from cref_jax.env import Outcome
 from cref_jax.errors import ConfigError
-from cref_jax.physics import EngineName
+from cref_jax.physics.records import EngineName
 from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
 from cref_jax.terrain import Terrain, cross_section, lanes

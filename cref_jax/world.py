@@ -9,7 +9,8 @@ from jaxtyping import PRNGKeyArray
 
 from cref_jax import terrain
 from cref_jax.config import Config
-from cref_jax.physics import Body, Physics
+from cref_jax.physics.records import Body
+from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, exported, leaves, losses, network, ppo, robot, runs, vectors
+from cref_jax import config, exported, leaves, network, ppo, robot, runs, vectors
 from cref_jax.config import Config
 
 ROBOT = robot.load(config.Robot())
@@ -39,7 +39,7 @@ def policy(variant: config.Variant, net: config.Network = SMALL) -> runs.Policy:
         leaf + 0.05 * jax.random.normal(k, leaf.shape)
         for k, leaf in zip(jax.random.split(key, len(flat)), flat, strict=True)
     ]
-    params = losses.Params(jax.tree.unflatten(tree, drawn), {})
+    params = ppo.Params(jax.tree.unflatten(tree, drawn), {})
     train = ppo.initial_state(params, OBS, 1, c.ppo)
     mean, std = 0.2 * jax.random.normal(key, (OBS,)), jnp.linspace(0.2, 2.0, OBS)
     obs = train.statistics.obs.replace(mean=mean, std=std)

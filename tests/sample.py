@@ -9,7 +9,7 @@ import numpy as np
 from cref_jax import config, episode
 from cref_jax.config import Config
 from cref_jax.episode import EnvState
-from cref_jax.physics import Physics
+from cref_jax.physics.simulation import Physics
 from cref_jax.world import World, make_world
 
 C = config.override(

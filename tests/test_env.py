@@ -12,7 +12,7 @@ import pytest
 from sample import ROBOTS, C, assert_equal, one, put
 
 from cref_jax import config, env, foothold, gait, observation, reward
-from cref_jax.physics import Physics
+from cref_jax.physics.simulation import Physics
 
 LENGTH = C.terrain.lane_length
 

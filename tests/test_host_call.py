@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import host_call
+from cref_jax.physics import xla_callback
 
 
 def scaled(arguments, results):
@@ -16,12 +16,12 @@ def scaled(arguments, results):
     results[1][...] = count + flags.sum(axis=-1)
 
 
-host_call.register("test_scaled", scaled)
+xla_callback.register("test_scaled", scaled)
 
 
 def call(x, factor, count, flags):
     shapes = jax.ShapeDtypeStruct(x.shape, x.dtype), jax.ShapeDtypeStruct((), jnp.int32)
-    return host_call.call("test_scaled", shapes, x, factor, count, flags)
+    return xla_callback.call("test_scaled", shapes, x, factor, count, flags)
 
 
 FLAGS = jnp.array([True, False, True])

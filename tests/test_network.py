@@ -5,7 +5,8 @@ import pytest
 from flax import linen as nn
 from jax.test_util import check_grads
 
-from cref_jax import config, layers, network
+from cref_jax import config, network
+from cref_jax.network import layers, modules
 
 T, E, OBS, J = 6, 4, 7, 3
 SMALL = config.Network(variant="blind", token=8, lstm=10, gru=12, actor=(16, 8), critic=(16, 8))
@@ -200,14 +201,14 @@ def test_residual_fusion_worked_by_hand():
         "mix": {"kernel": eye, "bias": jnp.zeros(2)},
         "content_gate": {"kernel": jnp.hstack([2 * eye, 0 * eye]), "bias": jnp.zeros(4)},
     }
-    f = network.GatedResidualFusion().apply({"params": params}, jnp.array([[[1.0, 3.0]]]))
+    f = modules.GatedResidualFusion().apply({"params": params}, jnp.array([[[1.0, 3.0]]]))
     np.testing.assert_allclose(f[0, 0], [0.367879, 4.0], atol=1e-5)
 
 
 @pytest.mark.parametrize(("bias", "expected"), [(50.0, "memory"), (-50.0, "feature")])
 def test_the_highway_gate_chooses_between_memory_and_feature(bias, expected):
     f = jax.random.normal(jax.random.key(0), (T, E, 3))
-    fusion = network.RecurrentFusion(5)
+    fusion = modules.RecurrentFusion(5)
     begins = jnp.zeros((T, E), bool)
     start = jnp.zeros((E, 5))
     params = jax.jit(fusion.init)(jax.random.key(1), start, f, begins)["params"]

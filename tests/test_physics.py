@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from cref_jax import config, errors, geometry, robot, terrain
-from cref_jax.host_physics import Dynamics
-from cref_jax.physics import Body, Physics, resolve_engine
+from cref_jax.physics.records import Body, Dynamics
+from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.robot import kinematics
 
 ROBOTS = 200

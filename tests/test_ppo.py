@@ -10,14 +10,15 @@ import pytest
 from brax.training.agents.ppo.losses import compute_gae
 from jax.test_util import check_grads
 
-from cref_jax import config, gaussian, losses, network, ppo, readout
+from cref_jax import config, network, ppo
+from cref_jax.ppo import auxiliary, gaussian, losses
 
 T, E, OBS, CRITIC_OBS, J = 5, 8, 4, 6, 2
 C = config.PPO(epochs=2, minibatches=2)
 SMALL = config.Network(variant="blind", token=6, lstm=5, gru=7, actor=(8,), critic=(8,))
 FEATURES = 6  # of a blind policy: as many as of a token
 KEY = jax.random.key(0)
-NETWORKS = losses.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
+NETWORKS = ppo.Networks(network.Actor(SMALL, J).apply, network.Critic(SMALL).apply)
 
 
 def column(*values):
@@ -28,7 +29,7 @@ def column(*values):
 def initial_params(seed=0):
     carry, no = network.initial_carry(SMALL, 1), jnp.zeros((1, 1), bool)
     key_actor, key_critic = jax.random.split(jax.random.key(seed))
-    params = losses.Params(
+    params = ppo.Params(
         network.Actor(SMALL, J).init(key_actor, carry, jnp.zeros((1, 1, OBS)), no),
         network.Critic(SMALL).init(key_critic, jnp.zeros((1, 1, CRITIC_OBS))),
     )
@@ -70,7 +71,7 @@ def initial_state(c=C):
     return ppo.initial_state(initial_params(), OBS, CRITIC_OBS, c)
 
 
-judge = jax.jit(lambda rollout: ppo.judge(initial_state().statistics, rollout, C))
+judge = jax.jit(lambda rollout: ppo.prepare_batch(initial_state().statistics, rollout, C))
 
 
 @jax.jit
@@ -191,7 +192,7 @@ def test_the_loss_worked_by_hand():
     # KL = .01/2 = .005
     # total = -2.199318 + 1*.81 + 1*5 - .005*1.418939 = 3.603588
     one = lambda x: jnp.full((1, 1), x)
-    batch = losses.Batch(
+    batch = ppo.Batch(
         obs=jnp.zeros((1, 1, 1)),
         critic_obs=jnp.zeros((1, 1, 1)),
         velocity=jnp.zeros((1, 1, 3)),
@@ -206,10 +207,10 @@ def test_the_loss_worked_by_hand():
         carry=(),
     )
     said = lambda m: OneStep(m[None, None, None], jnp.zeros(1), jnp.array([[[1.0, 2.0, 0.0]]]))
-    networks = losses.Networks(
+    networks = ppo.Networks(
         lambda m, carry, obs, begins, sight: (carry, said(m)), lambda v, s: one(v)
     )
-    params = losses.Params(jnp.array(0.1), jnp.array(1.1))
+    params = ppo.Params(jnp.array(0.1), jnp.array(1.1))
     total, parts = losses.loss(params, batch, config.PPO(), networks)
     np.testing.assert_allclose(total, 3.603588, rtol=1e-6)
     expected = {
@@ -239,7 +240,7 @@ def mirrored_toy():
         return carry, Said(obs @ p["w"] + p["b"], jnp.zeros(J), jnp.zeros((*obs.shape[:2], 3)))
 
     turned = lambda x: -x
-    mirror = losses.Mirror(obs=turned, frames=turned, sight=lambda sight: sight, action=turned)
+    mirror = ppo.Mirror(obs=turned, frames=turned, sight=lambda sight: sight, action=turned)
     networks = NETWORKS._replace(actor=actor, mirror=mirror)
     params = {"w": jax.random.normal(KEY, (OBS, J)), "b": jnp.array([0.3, -0.1])}
     return networks, initial_params()._replace(actor=params)
@@ -281,7 +282,7 @@ def test_an_update_makes_the_policy_more_symmetric():
 def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():
     batch = judge(some_rollout())
     params = initial_params()
-    silent = readout.untaught(FEATURES, 2)
+    silent = auxiliary.initial_readout(FEATURES, 2)
     says = silent._replace(bias=jnp.array([1.0, -2.0]))
     c = dataclasses.replace(C, readout_weight=0.5)
     without, parts = losses.loss(params, batch, c, NETWORKS)
@@ -295,7 +296,7 @@ def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():
 def test_the_readout_teaches_the_actors_features():
     batch = judge(some_rollout())
     kernel = jax.random.normal(KEY, (FEATURES, 2))
-    params = initial_params()._replace(readout=readout.Readout(kernel, jnp.zeros(2)))
+    params = initial_params()._replace(readout=auxiliary.Readout(kernel, jnp.zeros(2)))
 
     def slope(weight):
         c = dataclasses.replace(C, readout_weight=weight)
@@ -319,7 +320,7 @@ def test_the_gradient_of_the_loss_agrees_with_finite_differences():
 
         @jax.jit
         def loss(rest, critic):
-            moved = losses.Params({"params": {**actor, **rest}}, critic)
+            moved = ppo.Params({"params": {**actor, **rest}}, critic)
             return losses.loss(moved, batch, C, NETWORKS)[0]
 
         rest = {k: 1.01 * v for k, v in actor.items() if k == "log_std"} | {

@@ -5,7 +5,8 @@ import pytest
 
 from cref_jax import config, geoms, robot, terrain
 from cref_jax.errors import ConfigError
-from cref_jax.physics import Body, Physics
+from cref_jax.physics.records import Body
+from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
 from cref_jax.terrain import lanes
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from cref_jax import config, holding, layers, network
+from cref_jax import config, network
+from cref_jax.network import frame_slots, layers, modules
 
 T, E, K, OBS, J = 6, 3, 3, 7, 2
 TOKENS = 48
@@ -109,8 +110,8 @@ def test_attention_agrees_with_projected_keys_and_values():
     # the textbook form, with K and V written out
     x = jax.random.normal(jax.random.key(0), (T, E, 8))
     tokens = jax.random.normal(jax.random.key(1), (T, E, TOKENS, 8))
-    module = network.CrossAttention(heads=2)
-    every = holding.holding(jnp.arange(T), T, 1)
+    module = modules.CrossAttention(heads=2)
+    every = frame_slots.holding(jnp.arange(T), T, 1)
     params = jax.jit(module.init)(jax.random.key(2), x, tokens, every)
     found, weights = jax.jit(module.apply)(params, x, tokens, every)
 
@@ -137,11 +138,11 @@ def test_attention_finds_the_token_that_answers_the_query():
         "output": {"kernel": eye},
     }
     tokens = jnp.zeros((1, 1, TOKENS, 2)).at[0, 0, 3].set(jnp.array([50.0, -50.0]))
-    found, weights = network.CrossAttention(heads=1).apply(
+    found, weights = modules.CrossAttention(heads=1).apply(
         {"params": params},
         jnp.array([[[1.0, -1.0]]]),
         tokens,
-        holding.holding(jnp.zeros(1, int), 1, 1),
+        frame_slots.holding(jnp.zeros(1, int), 1, 1),
     )
     assert int(weights[0, 0, 0].argmax()) == 3
     np.testing.assert_allclose(weights[0, 0, 0, 3], 1.0, atol=1e-6)
@@ -167,7 +168,7 @@ def test_convolution_agrees_with_xla(kernel, stride):
 
 def test_tokens_are_local_and_in_the_order_of_the_image():
     frames = jnp.zeros((1, 1, 48, 64))
-    tokenizer = network.DepthTokenizer(C)
+    tokenizer = modules.DepthTokenizer(C)
     tokens = jax.jit(lambda p, images: tokenizer.apply(p, network.in_patches(C, images)))
     params = jax.jit(tokenizer.init)(jax.random.key(0), network.in_patches(C, frames))
     flat = tokens(params, frames)
@@ -181,7 +182,7 @@ def test_tokens_are_local_and_in_the_order_of_the_image():
 def test_compression_is_a_layer_on_the_means_of_blocks():
     frames = jnp.zeros((1, 1, 48, 64)).at[0, 0, 8:16, 16:24].set(0.5)  # block row 1, column 2
     c = config.override(C, {"compressed": 3})
-    module, frames = network.DepthCompression(c), network.in_patches(c, frames)
+    module, frames = modules.DepthCompression(c), network.in_patches(c, frames)
     params = jax.jit(module.init)(jax.random.key(0), frames)
     kernel = params["params"]["layer_0"]["kernel"]
     expected = nn.elu(0.5 * kernel[1 * 8 + 2])
@@ -218,7 +219,7 @@ def test_each_ablation_takes_away_its_part_alone(obs):
 
 def test_without_the_highway_the_feature_reaches_the_action_through_memory_alone(obs):
     f = jax.random.normal(jax.random.key(0), (T, E, 3))
-    fusion = network.RecurrentFusion(5, highway=False)
+    fusion = modules.RecurrentFusion(5, highway=False)
     params = jax.jit(fusion.init)(jax.random.key(1), jnp.zeros((E, 5)), f, NEVER)
     _, y, gate = jax.jit(fusion.apply)(params, jnp.zeros((E, 5)), f, NEVER)
     p = params["params"]

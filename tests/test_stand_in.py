@@ -11,7 +11,8 @@ from sample import put
 from cref_jax import deploy, depth, env, episode, evaluation, sim2sim, stand_in, terrain
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
-from cref_jax.physics import Body, Physics
+from cref_jax.physics.records import Body
+from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import Lane, StandIn, Start
 

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from cref_jax import config, layers, losses, network, ppo
+from cref_jax import config, ppo
+from cref_jax.network import layers, modules
 
 
 class Toy(NamedTuple):
@@ -38,7 +39,7 @@ class Recaller(nn.Module):
     def __call__(self, carry, obs, begins, sight=None):
         begins = begins if self.memory else jnp.ones_like(begins)
         x = nn.elu(nn.Dense(self.hidden, name="enter")(obs))
-        carry, y, _ = network.RecurrentFusion(self.hidden, name="recurrent")(carry, x, begins)
+        carry, y, _ = modules.RecurrentFusion(self.hidden, name="recurrent")(carry, x, begins)
         mean = nn.Dense(1, name="act")(y)
         log_std = self.param("log_std", nn.initializers.constant(-0.5), (1,))
         return carry, Said(mean, log_std, jnp.zeros((*obs.shape[:2], 0)))
@@ -58,10 +59,10 @@ def solve(toy: Toy, c: config.PPO, iterations: int, memory=True, num_envs=64, se
     """Learn the toy by PPO and say how the learnt policy behaves."""
     actor, width = Recaller(memory), toy.observe(jnp.array(0), jnp.array(1.0)).size
     value_net = layers.MLP((32, 1), name="value")
-    networks = losses.Networks(actor.apply, lambda p, s: value_net.apply(p, s)[..., 0])
+    networks = ppo.Networks(actor.apply, lambda p, s: value_net.apply(p, s)[..., 0])
     key_actor, key_critic, key = jax.random.split(jax.random.key(seed), 3)
     no, empty = jnp.zeros((1, 1), bool), lambda n: jnp.zeros((n, actor.hidden))
-    params = losses.Params(
+    params = ppo.Params(
         actor.init(key_actor, empty(1), jnp.zeros((1, 1, width)), no),
         value_net.init(key_critic, jnp.zeros((1, 1, 2))),
     )

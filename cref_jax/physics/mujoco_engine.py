@@ -10,7 +10,6 @@ import collections
 import contextlib
 import zlib
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,30 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco.batch import Batch
 
-from cref_jax import host_call
+from cref_jax.physics import xla_callback
+from cref_jax.physics.records import Dynamics, Substep
 from cref_jax.system import parallel
 
 _TARGET = "cref_jax_mujoco_substep"
 _ENGINES: "dict[int, HostEngine]" = {}  # the first one of each number, which steps for all
-
-
-class Dynamics(NamedTuple):
-    """What differs from one robot to the next; drawn anew at each reset."""
-
-    friction: Float[Array, ""]  # sliding friction coefficient
-    payload: Float[Array, ""]  # kg added to the trunk
-    com_shift: Float[Array, "3"]  # m, shift of the trunk's centre of mass, in its frame
-    kp: Float[Array, " J"]  # N m / rad
-    kd: Float[Array, " J"]  # N m s / rad
-
-
-class Substep(NamedTuple):
-    """What a physics substep returns."""
-
-    qpos: Float[Array, " Q"]  # m, quaternion, rad
-    qvel: Float[Array, " V"]  # m/s, rad/s
-    warmstart: Float[Array, " V"]  # the solver's last acceleration
-    force: Float[Array, "F 3"]  # N, contact force on each foot, world frame
 
 
 class HostEngine:
@@ -79,7 +60,7 @@ class HostEngine:
             *jax.lax.platform_dependent(
                 number,
                 *operands,
-                cpu=lambda *x: host_call.call(_TARGET, results, *x),
+                cpu=lambda *x: xla_callback.call(_TARGET, results, *x),
                 default=lambda *x: jax.pure_callback(
                     _called_back, results, *x, vmap_method="broadcast_all"
                 ),
@@ -133,7 +114,7 @@ def _called_back(*arguments: Array) -> tuple[np.ndarray, ...]:
     return tuple(results)
 
 
-host_call.register(_TARGET, _substep)
+xla_callback.register(_TARGET, _substep)
 
 
 class _Simulations:

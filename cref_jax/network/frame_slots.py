@@ -54,7 +54,7 @@ def by_step(x: Float[Array, "K E S D"], h: Holding) -> Float[Array, "T E D"]:
     return x[h.frame, :, h.slot]
 
 
-def repeated(x: Float[Array, "K E D"], h: Holding) -> Float[Array, "T E D"]:
+def repeat_frames(x: Float[Array, "K E D"], h: Holding) -> Float[Array, "T E D"]:
     """Return what is told of each frame at each step that holds it."""
     slots = jnp.broadcast_to(x[:, :, None], (*x.shape[:2], h.step.shape[1], x.shape[2]))
     return by_step(slots, h)

@@ -17,7 +17,7 @@ class Readout(NamedTuple):
     bias: Float[Array, " M"]
 
 
-def untaught(features: int, size: int) -> Readout:
+def initial_readout(features: int, size: int) -> Readout:
     """Return the map that has learned nothing."""
     return Readout(kernel=jnp.zeros((features, size)), bias=jnp.zeros(size))
 

@@ -6,7 +6,6 @@ spheres: one contact a plane, at constant cost, the same in every engine.
 """
 
 import importlib.util
-from typing import Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -15,38 +14,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cref_jax import config, geometry, robot, terrain
-from cref_jax.device_physics import MjxEngine, WarpEngine
-from cref_jax.host_physics import Dynamics, HostEngine, Substep
+from cref_jax.physics.mjx_engine import MjxEngine, WarpEngine
+from cref_jax.physics.mujoco_engine import HostEngine
+from cref_jax.physics.records import Backend, Body, Dynamics, Engine, EngineName
 from cref_jax.robot import kinematics
 
 MAX_DEPTH = 0.05  # m; a foot that swings at 8 m/s is 4 cm in a wall after one substep
-Backend = Literal["mjx", "mujoco", "warp"]
-EngineName = Literal["auto", "mjx", "mujoco", "warp"]
-
-
-class Body(NamedTuple):
-    """The robot's mechanical state, in the lane's own coordinates."""
-
-    qpos: Float[Array, " Q"]  # m, quaternion (w x y z), rad
-    qvel: Float[Array, " V"]  # m/s in the world frame, rad/s in the body frame, rad/s
-    warmstart: Float[Array, " V"]  # the solver's last acceleration
-
-
-class Engine(Protocol):
-    """Advances one robot by one substep; `jax.vmap` gives many."""
-
-    def substep(
-        self,
-        qpos: Float[Array, " Q"],
-        qvel: Float[Array, " V"],
-        warmstart: Float[Array, " V"],
-        target: Float[Array, " M"],
-        plane_position: Float[Array, "P 3"],
-        plane_rotation: Float[Array, "P 4"],
-        dynamics: Dynamics,
-    ) -> Substep:
-        """Return the state one substep on."""
-        ...
 
 
 class Physics:

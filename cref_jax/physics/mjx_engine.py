@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cref_jax.errors import ConfigError
-from cref_jax.host_physics import Dynamics, Substep
+from cref_jax.physics.records import Dynamics, Substep
 
 with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed
     from mujoco import mjx

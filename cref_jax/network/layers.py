@@ -13,7 +13,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cref_jax import recurrent
+from cref_jax.network import recurrent
 
 _EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's own
 

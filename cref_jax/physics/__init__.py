@@ -1,0 +1,1 @@
+"""The physics step, with one engine per backend."""
