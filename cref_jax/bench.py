@@ -23,12 +23,12 @@ from rich.table import Table
 
 from cref_jax import brax_peer, cli, config, learn, peers, rollout, roofline, runs, stages
 from cref_jax.config import Config, limits
+from cref_jax.env.world import World
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.roofline import Rates
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import lanes
-from cref_jax.world import World
 
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
 BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the same"

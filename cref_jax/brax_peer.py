@@ -6,7 +6,7 @@ import jax
 from brax.training.agents.ppo import networks, train
 
 from cref_jax import config
-from cref_jax.brax_env import BraxEnv, mend_brax, wrap
+from cref_jax.env.brax_env import BraxEnv, mend_brax, wrap
 from cref_jax.system import parallel
 
 ITERATIONS = 4  # of each of two parts; the first part compiles

@@ -10,9 +10,9 @@ from rich.table import Table
 
 from cref_jax import evaluation, geometry, ppo, rollout, trials
 from cref_jax.config import Config
+from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
-from cref_jax.world import World, make_world
 
 SECONDS = 10.0  # of a trial; assumed
 SETTLING = 2.0  # s that a robot has to come to rest or to speed; assumed

@@ -29,10 +29,10 @@ from cref_jax import (
     runs,
     table,
 )
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.system import jax_setup, parallel
-from cref_jax.world import World
 
 Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal

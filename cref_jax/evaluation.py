@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cref_jax import ppo, rollout, sideways, trials
 from cref_jax.config import Config
-from cref_jax.episode import Ending
+from cref_jax.env.state import Ending
+from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import generators, lanes
-from cref_jax.world import World, make_world
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # of an episode on flat ground; assumed

@@ -22,9 +22,9 @@ import numpy as np
 
 from cref_jax import config, deploy, learn, learner, leaves, ppo, robot, runs, vectors
 from cref_jax.config import Config, folders
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
-from cref_jax.world import World
 
 BUNDLED = "mixed"  # the policy that comes with the package
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down

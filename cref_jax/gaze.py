@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from cref_jax import depth
 from cref_jax.config import Camera, Config
-from cref_jax.episode import EnvState
+from cref_jax.env.state import EnvState
+from cref_jax.env.world import World
 from cref_jax.robot import kinematics
-from cref_jax.world import World
 
 EDGE = 0.03  # m off the plane of the neighbours; assumed: above rounding and a slope's columns
 LINK = 0.02  # m nearer than the ground; assumed: above the rounding of 16 bits

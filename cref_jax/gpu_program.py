@@ -27,11 +27,11 @@ from rich.table import Table
 
 from cref_jax import cli, depth, hlo, learn, runs
 from cref_jax.config import Config, limits
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Backend, Body
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
-from cref_jax.world import World
 
 LAUNCH = 3e-6  # s; assumed: the least time of a kernel, its launch included
 BANDWIDTH_SHARE = 0.8  # assumed: what a kernel gets of the card's bandwidth

@@ -18,9 +18,9 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, PyTree
 
 from cref_jax import mirror, ppo, ramp, rollout
+from cref_jax.env.world import World
 from cref_jax.ppo import Losses
 from cref_jax.ramp import Ramp
-from cref_jax.world import World
 
 Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
 

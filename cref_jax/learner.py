@@ -13,9 +13,9 @@ import numpy as np
 
 from cref_jax import config, learn, leaves
 from cref_jax.config import Config
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.runs import Policy
-from cref_jax.world import World
 
 _SETTINGS, _ITERATION = "settings", "iterations"  # names that no leaf has
 

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Float16, Int
 
-from cref_jax import config, network, observation
+from cref_jax import config, network
+from cref_jax.env import observations
 from cref_jax.physics.records import Body
 from cref_jax.ppo import Mirror
 
@@ -76,7 +77,7 @@ def body(state: Body, of: Joints) -> Body:
 def proprioception(seen: Float[Array, "*n O"], of: Joints) -> Float[Array, "*n O"]:
     """Return M o^p: what the robot's mirror image senses."""
     count = (seen.shape[-1] - 9) // 3
-    where = observation.slices(count)
+    where = observations.slices(count)
     signs = {"angular_velocity": AXIAL, "gravity": POLAR, "command": COMMAND}
     parts = [
         signs[name] * seen[..., part] if name in signs else of.flipped(seen[..., part])

@@ -27,7 +27,6 @@ from cref_jax import (
     evaluation,
     exported,
     film,
-    foothold,
     network,
     panel,
     ppo,
@@ -36,12 +35,13 @@ from cref_jax import (
     runs,
 )
 from cref_jax.config import Config
+from cref_jax.env import footholds
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.rendering import robot_scene
 from cref_jax.system import jax_setup
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
-from cref_jax.world import World
 
 T = TypeVar("T")
 Agent = Literal["trained", "stand", "random"]
@@ -217,7 +217,7 @@ def _advance(
     step = Step(
         qpos=robots.env.body.qpos[0],
         airborne=outcome.measures.airborne[0],
-        marks=foothold.points(jax.tree.map(lambda x: x[0], robots.env.candidates)),
+        marks=footholds.points(jax.tree.map(lambda x: x[0], robots.env.candidates)),
         mind=mind,
         progress=outcome.measures.progress[0],
         ending={name: flag[0] for name, flag in outcome.ending._asdict().items()},

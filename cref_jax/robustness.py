@@ -13,10 +13,10 @@ from rich.table import Table
 
 from cref_jax import config, evaluation, paper, ppo, proportion, sideways, table, trials
 from cref_jax.config import Config
-from cref_jax.episode import Spread
+from cref_jax.env.state import Spread
+from cref_jax.env.world import World
 from cref_jax.physics.simulation import Physics
 from cref_jax.trials import Trials
-from cref_jax.world import World
 
 EVERYTHING = "everything"
 PARTS = Spread._fields

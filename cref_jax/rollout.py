@@ -14,13 +14,14 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
 
-from cref_jax import config, depth, env, episode, network, ppo
-from cref_jax.env import Outcome
-from cref_jax.episode import Ending, EnvState
-from cref_jax.observation import Observation
+from cref_jax import config, depth, network, ppo
+from cref_jax.env import environment, resets
+from cref_jax.env.environment import Outcome
+from cref_jax.env.observations import Observation
+from cref_jax.env.state import Ending, EnvState, even_spread
+from cref_jax.env.world import World
 from cref_jax.ppo import auxiliary
 from cref_jax.system import xla_kernels
-from cref_jax.world import World
 
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
@@ -89,7 +90,7 @@ class Trace(NamedTuple):
 
     reward: Float[Array, "T E"]
     ending: Ending
-    measures: env.Measures
+    measures: environment.Measures
 
 
 def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Robots:
@@ -140,7 +141,7 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
     highest = min(c.curriculum.start_level, world.lanes.levels - 1)
     levels = jax.random.randint(key_level, (num_envs,), 0, highest + 1)
     split = lambda k: jax.random.split(k, num_envs)
-    state = jax.vmap(episode.reset, in_axes=(None, 0, 0, 0))(world, split(key_reset), kinds, levels)
+    state = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0))(world, split(key_reset), kinds, levels)
     longest = round(c.episode.length / c.physics.control_period)
     state = state.replace(step=jax.random.randint(key_step, (num_envs,), 0, longest))
     return placed(world, state, split(key_see))
@@ -149,7 +150,7 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
 def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
     """Return the robots in these states, with nothing seen or remembered; a key for each."""
     c, num_envs = world.config, state.kind.shape[0]
-    seen = jax.vmap(env.observe, in_axes=(None, 0, 0))(world, state, keys)
+    seen = jax.vmap(environment.observe, in_axes=(None, 0, 0))(world, state, keys)
     sees = c.network.variant != "blind"
     return Robots(
         env=state,
@@ -165,7 +166,7 @@ def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
 
 def hardened(robots: Robots, share: Float[Array, ""]) -> Robots:
     """Return the robots with this share of all that is randomised from the next draw on."""
-    spread = episode.evenly(jnp.broadcast_to(share, robots.begins.shape))
+    spread = even_spread(jnp.broadcast_to(share, robots.begins.shape))
     return robots.replace(env=robots.env.replace(spread=spread))
 
 
@@ -216,7 +217,7 @@ def advance(
     world: World, robots: Robots, memory: Memory, action: Float[Array, "E J"]
 ) -> tuple[Robots, Outcome]:
     """Step every robot with its action, and its camera."""
-    state, outcome = env.step_all(world, robots.env, action)
+    state, outcome = environment.step_all(world, robots.env, action)
     over = outcome.ending.terminated | outcome.ending.truncated
     feed = robots.feed and _next_feed(world, robots.feed, robots.env, over)
     return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome
@@ -244,7 +245,7 @@ def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pix
 
 def _images(world: World, state: EnvState, is_profile: bool) -> Float16[Array, "E H W"]:
     """Return what cameras see that are all on lanes level across, or all not."""
-    look = functools.partial(env.depth_image, is_profile=is_profile)
+    look = functools.partial(environment.depth_image, is_profile=is_profile)
     return jax.vmap(look, in_axes=(None, 0))(world, state).astype(jnp.float16)
 
 

@@ -23,11 +23,11 @@ from jax.sharding import Mesh
 
 from cref_jax import config, learn, ppo
 from cref_jax.config import Config, folders
+from cref_jax.env.world import World, make_world
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.training.checkpoint import Checkpoints
-from cref_jax.world import World, make_world
 
 ROOT = Path("runs")
 

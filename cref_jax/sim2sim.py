@@ -17,6 +17,7 @@ from rich.progress import track
 from cref_jax import cli, deploy, evaluation, exported, film, runs, stand_in, transfer
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.physics.simulation import Physics
@@ -24,7 +25,6 @@ from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.system import jax_setup, parallel
-from cref_jax.world import World
 
 FRAME_RATE = 25.0  # 1/s, of a film
 SIZE = (960, 540)  # pixels of it

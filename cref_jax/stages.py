@@ -11,8 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cref_jax import depth, env, foothold, learn, ppo, rollout
-from cref_jax.world import World
+from cref_jax import depth, learn, ppo, rollout
+from cref_jax.env import environment, footholds
+from cref_jax.env.world import World
 
 STEPS = 24  # control steps of one call, as many as a horizon has
 
@@ -21,9 +22,9 @@ def step_environment(world: World, robots: rollout.Robots) -> Any:
     """Step the whole environment under small random actions."""
     joints = robots.env.action.shape[-1]
 
-    def step(state: env.EnvState, key: jax.Array) -> tuple[env.EnvState, Any]:
+    def step(state: environment.EnvState, key: jax.Array) -> tuple[environment.EnvState, Any]:
         action = 0.3 * jax.random.normal(key, (*state.step.shape, joints))
-        state, outcome = env.step_all(world, state, action)
+        state, outcome = environment.step_all(world, state, action)
         return state, (outcome.reward.sum(), outcome.observation.privileged.sum())
 
     return jax.lax.scan(step, robots.env, jax.random.split(jax.random.key(1), STEPS))
@@ -33,7 +34,7 @@ def step_physics(world: World, robots: rollout.Robots) -> Any:
     """Step the physics alone, with its terrain queries."""
     target = jnp.asarray(world.physics.robot.nominal_pose)
 
-    def one(state: env.EnvState, body: Any) -> Any:
+    def one(state: environment.EnvState, body: Any) -> Any:
         ground = world.lanes.tile(state.level, state.kind, state.variant)
         return world.physics.step(
             ground, body, jnp.stack([target, target]), state.delay, state.dynamics
@@ -46,7 +47,7 @@ def step_physics(world: World, robots: rollout.Robots) -> Any:
 def query_terrain(world: World, robots: rollout.Robots) -> Any:
     """Ask for the tangent planes of all spheres, as often as a control step does."""
 
-    def one(state: env.EnvState, body: Any) -> Any:
+    def one(state: environment.EnvState, body: Any) -> Any:
         return world.physics.planes(world.lanes.tile(state.level, state.kind, state.variant), body)
 
     def query(body: Any, _: None) -> tuple[Any, None]:
@@ -63,7 +64,7 @@ def render_frames(world: World, robots: rollout.Robots) -> Any:
     c = world.config
     count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
 
-    def render(state: env.EnvState, _: None) -> tuple[env.EnvState, None]:
+    def render(state: environment.EnvState, _: None) -> tuple[environment.EnvState, None]:
         images = rollout.exposed(world, state)
         moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
         return state.replace(camera_pitch=state.camera_pitch + moved), None
@@ -75,12 +76,12 @@ def find_footholds(world: World, robots: rollout.Robots) -> Any:
     """Find candidates and measure the distance to them, as each control step does."""
     c = world.config.foothold
 
-    def one(state: env.EnvState, body: Any) -> Any:
+    def one(state: environment.EnvState, body: Any) -> Any:
         ground = world.lanes.tile(state.level, state.kind, state.variant)
-        soles = foothold.soles(world.physics.links(body), world.physics.robot)
-        near = foothold.distance(state.candidates, soles.centre)
-        ahead = foothold.candidates(ground, soles.centre, soles.heading, state.command[0], c)
-        lost = foothold.unsupported(ground, soles, c)
+        soles = footholds.soles(world.physics.links(body), world.physics.robot)
+        near = footholds.distance(state.candidates, soles.centre)
+        ahead = footholds.candidates(ground, soles.centre, soles.heading, state.command[0], c)
+        lost = footholds.unsupported(ground, soles, c)
         return near.sum() + ahead.z.sum() + ahead.accepted.sum() + lost.sum()
 
     def find(body: Any, _: None) -> tuple[Any, None]:

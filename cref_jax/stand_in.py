@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from cref_jax import config, geoms, robot, stall
+from cref_jax import config, geoms, robot
 from cref_jax.config import Config
 from cref_jax.deploy import Policy, Status
 from cref_jax.disturbance import UNDISTURBED, Channel, Disturbance
+from cref_jax.env import stall
 from cref_jax.errors import ConfigError
 
 MOST_BOXES = 20_000

@@ -14,12 +14,12 @@ from rich.table import Table
 
 from cref_jax import config, evaluation, paper, ppo, proportion, sideways, trials
 from cref_jax.config import Config
+from cref_jax.env.world import World, make_world
 from cref_jax.paper import Cell
 from cref_jax.physics.simulation import Physics
 from cref_jax.proportion import Rate
 from cref_jax.terrain import lanes
 from cref_jax.trials import Trials
-from cref_jax.world import World, make_world
 
 LANES = {"stairs": ("ascent", "descent"), "gap": ("gap",), "platform": ("platform",)}
 UP, DOWN = 0, 1  # in LANES["stairs"]

@@ -18,13 +18,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cref_jax import cli, errors, evaluation, exported, learn, learner, runs
 from cref_jax.config import Config, limits
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.progress import Reporter
 from cref_jax.system import interrupts, jax_setup, parallel
 from cref_jax.training.checkpoint import Checkpoints, lock
-from cref_jax.world import World
 
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
 NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings

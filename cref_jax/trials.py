@@ -19,12 +19,13 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import depth, episode, ppo, rollout, sideways, stall
+from cref_jax import depth, ppo, rollout, sideways
 from cref_jax.config import Config
-from cref_jax.env import Outcome
-from cref_jax.episode import Ending, Spread
+from cref_jax.env import resets, stall
+from cref_jax.env.environment import Outcome
+from cref_jax.env.state import Ending, Spread, even_spread
+from cref_jax.env.world import World
 from cref_jax.rollout import Robots
-from cref_jax.world import World
 
 FALLS = ("unstable", "tilted", "low", "hit", "dropped")  # of Ending; the first that is true counts
 FAILURES = (*FALLS, "stalled", "late")  # late: on its feet and moving, but not at the end in time
@@ -86,7 +87,7 @@ def begin(
     """Return the robots at the start of the trials of these numbers, on these lanes."""
     key = jax.random.key(SEED + seed)
     arrays = [jnp.asarray(x, jnp.int32) for x in (number, kind, level)]
-    return _begin(world, key, *arrays, episode.evenly(np.ones(len(number))))
+    return _begin(world, key, *arrays, even_spread(np.ones(len(number))))
 
 
 def run(
@@ -114,7 +115,7 @@ def run(
     )  # fmt: skip
     world, walker = jax.device_put((world, walker), NamedSharding(mesh, P()))
     key = jax.random.key(SEED + seed)
-    spread = asked.spread or episode.evenly(np.ones(len(asked.number)))
+    spread = asked.spread or even_spread(np.ones(len(asked.number)))
     found: dict[int, Trials] = {}
     robots, clock = None, 0
     while places.left:
@@ -245,7 +246,7 @@ def _started(
 ) -> Robots:  # fmt: skip
     keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(number)
     split = jax.vmap(jax.random.split)(keys)
-    reset = jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, 0))
+    reset = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, 0))
     state = reset(world, split[:, 0], kind, level, spread)
     return rollout.placed(world, state, split[:, 1])
 

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float16
 
-from cref_jax import config, depth, network, observation, ppo, rollout
+from cref_jax import config, depth, network, ppo, rollout
+from cref_jax.env import observations
+from cref_jax.env.world import World
 from cref_jax.robot import Robot
-from cref_jax.world import World
 
 STEPS = 64  # of the test vectors, in two episodes of half as many
 HOLES = (slice(8, 16), slice(20, 44))  # rows and columns of one frame that are 0, or NaN below
@@ -70,7 +71,7 @@ def test_vectors(world: World, train: ppo.TrainState) -> dict[str, np.ndarray]:
 
 def record(world: World, train: ppo.TrainState, steps: int, key: Array) -> Recorded:
     """Return what one robot's sensors report while the policy walks it from a lane's start."""
-    where = observation.slices(len(world.physics.robot.joint_names))
+    where = observations.slices(len(world.physics.robot.joint_names))
     nominal = world.physics.robot.nominal_pose
 
     def step(robots: rollout.Robots, _: None) -> tuple[rollout.Robots, Recorded]:

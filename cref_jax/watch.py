@@ -22,14 +22,14 @@ from rich.progress import Progress
 
 from cref_jax import config, evaluation, exported, network, ppo, rollout, runs, trials
 from cref_jax.config import Config
-from cref_jax.env import Outcome
+from cref_jax.env.environment import Outcome
+from cref_jax.env.world import World, make_world
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.rendering import robot_scene
 from cref_jax.runs import Policy
 from cref_jax.terrain import Terrain, cross_section, lanes
 from cref_jax.terrain.atlas import Atlas
-from cref_jax.world import World, make_world
 
 CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
 STAIRS = ("stairs_up", "stairs_down", "ascent", "descent")

@@ -39,11 +39,11 @@ from matplotlib.figure import Figure, SubFigure
 
 from cref_jax import cli, gaze, watch
 from cref_jax.config import Config
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section
 from cref_jax.watch import Moment, Watched
-from cref_jax.world import World
 
 EDGE = (
     0.03  # m off the plane of the neighbours; assumed: above rounding and the slope's 2 cm columns

@@ -41,13 +41,14 @@ import tyro
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, exported, foothold, terrain, watch
+from cref_jax import cli, evaluation, exported, terrain, watch
+from cref_jax.env import footholds
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.robot import kinematics
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section, lanes
 from cref_jax.watch import Moment, Watched
-from cref_jax.world import World
 
 KINDS = ("ascent", "descent")  # of lane, one flight each
 TREAD = 0.30  # m, terrains/flight.toml
@@ -206,7 +207,7 @@ def _feet(world: World, state) -> tuple[Float[Array, "F 3"], Bool[Array, " S"]]:
     centres = kinematics.points(links, robot.spheres.body, robot.spheres.position)
     _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
     hits = (distance < robot.spheres.radius) & (normal[:, 0] < FACING)
-    return foothold.soles(links, robot).centre, hits
+    return footholds.soles(links, robot).centre, hits
 
 
 def summed(world: World, watched: Watched) -> dict[int, Way]:

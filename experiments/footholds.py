@@ -12,7 +12,8 @@ import numpy as np
 import tyro
 from matplotlib.axes import Axes
 
-from cref_jax import config, foothold, terrain
+from cref_jax import config, terrain
+from cref_jax.env import footholds
 from cref_jax.terrain import lanes
 
 SIZES = {"stairs_up": 0.15, "stairs_down": 0.15, "gap": 0.5, "slope": 0.3}  # m; m/m for the slope
@@ -48,7 +49,7 @@ def draw(axis: Axes, kind: str, size: float, command: float) -> None:
     height = terrain.height_at(ground, jnp.stack([lane_x, jnp.zeros(lane_x.size)], axis=-1))
     start = lane_x[np.argmax(np.abs(height) > 1e-6)] - BEFORE
     sole = jnp.broadcast_to(jnp.array([start, 0.0, 0.0]), (2, 3))
-    found = foothold.candidates(ground, sole, jnp.zeros(2), jnp.float32(command), c.foothold)
+    found = footholds.candidates(ground, sole, jnp.zeros(2), jnp.float32(command), c.foothold)
 
     x = (np.arange(c.foothold.points[0]) + 0.5) * c.foothold.spacing[0]
     gate = c.foothold.gate_time * command

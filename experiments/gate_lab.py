@@ -32,11 +32,11 @@ from matplotlib.axes import Axes
 
 from cref_jax import cli, watch
 from cref_jax.config import Config
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.system import jax_setup
 from cref_jax.terrain import Terrain, cross_section
 from cref_jax.watch import Moment, Watched
-from cref_jax.world import World
 
 RISKY = 0.20  # rad, |roll| or |pitch| above it, Sec. III-B
 WARM_UP = 1.0  # s; assumed: the memory is empty at first and the robot stands

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, episode
+from cref_jax import config
 from cref_jax.config import Config
-from cref_jax.episode import EnvState
+from cref_jax.env import resets
+from cref_jax.env.state import EnvState
+from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
-from cref_jax.world import World, make_world
 
 C = config.override(
     Config(),
@@ -30,7 +31,7 @@ def fresh_states() -> EnvState:
     """Return 512 robots at their start, of every kind and level in turn."""
     number, lanes = np.arange(512), world().lanes
     kinds, levels = jnp.asarray(lanes.kind_of(number)), jnp.asarray(number // len(lanes.turns) % 3)
-    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
+    reset = jax.jit(jax.vmap(resets.reset, in_axes=(None, 0, 0, 0)))
     return reset(world(), jax.random.split(jax.random.key(3), 512), kinds, levels)
 
 

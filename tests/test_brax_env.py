@@ -9,8 +9,9 @@ import pytest
 from brax.envs.wrappers import training
 from brax.training.agents.ppo import networks, train
 
-from cref_jax import config, env
-from cref_jax.brax_env import BraxEnv, mend_brax, wrap
+from cref_jax import config
+from cref_jax.env import environment
+from cref_jax.env.brax_env import BraxEnv, mend_brax, wrap
 
 C = config.override(
     config.Config(),
@@ -53,7 +54,7 @@ def test_a_robot_starts_at_one_of_the_levels_of_the_start(robots):
 
 def test_brax_sees_what_the_environment_gives(robots, wrapped):
     reset, step = wrapped
-    ours = jax.jit(jax.vmap(partial(env.step, robots.world)))
+    ours = jax.jit(jax.vmap(partial(environment.step, robots.world)))
     state = reset(keys())
     inner, total = state.pipeline_state, np.zeros(ROBOTS)
     for k in range(1, 13):

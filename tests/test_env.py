@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from sample import ROBOTS, C, assert_equal, one, put
 
-from cref_jax import config, env, foothold, gait, observation, reward
+from cref_jax import config
+from cref_jax.env import environment, footholds, gait, observations, rewards
 from cref_jax.physics.simulation import Physics
 
 LENGTH = C.terrain.lane_length
@@ -19,7 +20,7 @@ LENGTH = C.terrain.lane_length
 
 @pytest.fixture(scope="module")
 def step():
-    return jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
+    return jax.jit(jax.vmap(environment.step, in_axes=(None, 0, 0)))
 
 
 def still(robots):
@@ -42,7 +43,7 @@ def test_a_timeout_gives_a_fresh_robot_and_the_last_state_of_the_old_one(world, 
     np.testing.assert_array_equal(last.reward, seen.reward)
     np.testing.assert_array_equal(going.step, 501)
     # the observation is of the fresh robot
-    see = jax.vmap(lambda state: env.observe(world, state, jax.random.key(0)))
+    see = jax.vmap(lambda state: environment.observe(world, state, jax.random.key(0)))
     expected = jax.jit(see)(fresh)
     np.testing.assert_allclose(last.observation.privileged, expected.privileged, atol=1e-6)
     np.testing.assert_allclose(last.observation.velocity, expected.velocity, atol=1e-6)
@@ -110,8 +111,8 @@ def test_an_encoders_offset_is_seen_and_shifts_what_is_reached(world, step, robo
     exact = dict.fromkeys((f.name for f in dataclasses.fields(config.Randomisation)), 0.0)
     exact = {name: value for name, value in exact.items() if name.startswith("noise")}
     quiet = world.replace(config=config.override(C, {"randomisation": exact}))
-    part = observation.slices(12)["joint_position"]
-    see = lambda state: env.observe(quiet, one(state), jax.random.key(0))
+    part = observations.slices(12)["joint_position"]
+    see = lambda state: environment.observe(quiet, one(state), jax.random.key(0))
     seen, true = see(crooked), see(straight)
     np.testing.assert_allclose(
         seen.proprioception[part] - true.proprioception[part], shift, atol=1e-6
@@ -134,7 +135,7 @@ def test_the_same_key_gives_the_same_trajectory_and_another_one_another(world, s
 
 def test_an_environment_alone_is_the_same_one_as_in_a_batch(world, step, robots):
     alone, batch = one(robots, 5), robots
-    single = jax.jit(env.step)
+    single = jax.jit(environment.step)
     for k in range(20):
         action = jnp.sin(k + still(robots) + jnp.arange(12.0))
         batch, together = step(world, batch, action)
@@ -152,12 +153,16 @@ def test_an_environment_alone_is_the_same_one_as_in_a_batch(world, step, robots)
 def lived(world, state, force):
     """Return the state a step later and its snapshot, had it ended with this force on the feet."""
     links = world.physics.links(state.body)
-    soles = foothold.soles(links, world.physics.robot)
-    touching = reward.is_touching(force, C.reward)
-    feet, swings = gait.advanced(state.gait, touching, C.physics.control_period, C.reward.debounce)
+    soles = footholds.soles(links, world.physics.robot)
+    touching = rewards.is_touching(force, C.reward)
+    feet, swings = gait.update_gait(
+        state.gait, touching, C.physics.control_period, C.reward.debounce
+    )
     state = state.replace(gait=feet)
-    snapshot = env._snapshot(world, state, state.body, links, soles, force, swings, state.action)
-    return env._lived(world, state, state.body, soles, snapshot), snapshot
+    snapshot = environment._reward_snapshot(
+        world, state, state.body, links, soles, force, swings, state.action
+    )
+    return environment._next_state(world, state, state.body, soles, snapshot), snapshot
 
 
 def test_candidates_are_those_of_the_last_contact_and_judged_at_touchdown(world, robots):
@@ -182,7 +187,7 @@ def test_candidates_are_those_of_the_last_contact_and_judged_at_touchdown(world,
     _, landed = live(touched, down)
     assert landed.first_contact.tolist() == [True, False]
     assert float(landed.air_time[0]) == pytest.approx(5 * 0.02)
-    placed = reward.foothold_placement(landed, C.reward, world.physics.robot)
+    placed = rewards.foothold_placement(landed, C.reward, world.physics.robot)
     assert float(placed) > np.exp(-0.02 / 0.08)
 
 
@@ -225,7 +230,7 @@ def random_walk(world, state, steps: int):
 
     def once(state, key):
         action = jax.random.normal(key, state.action.shape)
-        state, outcome = jax.vmap(env.step, in_axes=(None, 0, 0))(world, state, action)
+        state, outcome = jax.vmap(environment.step, in_axes=(None, 0, 0))(world, state, action)
         finite = jax.tree.map(lambda x: jnp.isfinite(x).all(), (state.body, outcome.observation))
         sound = jnp.stack(jax.tree.leaves(finite)).all() & jnp.isfinite(outcome.reward).all()
         return state, (sound, outcome.ending)
@@ -255,14 +260,14 @@ def test_all_robots_step_as_each_would_alone(world, robots):
         push_left=robots.push_left.at[4].set(1),
         step=robots.step.at[1].set(997),
     )
-    each = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
+    each = jax.jit(jax.vmap(environment.step, in_axes=(None, 0, 0)))
     both = state, state
     ended = 0
     for _ in range(4):
         action = 0.3 * jnp.ones((8, 12))
         (ours, said), (theirs, expected) = (
             step(world, s, action)
-            for step, s in zip((jax.jit(env.step_all), each), both, strict=True)
+            for step, s in zip((jax.jit(environment.step_all), each), both, strict=True)
         )
         # not bit for bit: they are two programs, and XLA may round a sum in another order
         near = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)

@@ -7,8 +7,9 @@ import pytest
 import sample
 from sample import ROBOTS, C, assert_equal, on, one, put
 
-from cref_jax import config, episode, geometry, terrain
-from cref_jax.episode import Ending
+from cref_jax import config, geometry, terrain
+from cref_jax.env import commands, curriculum, events, resets, terminations
+from cref_jax.env.state import Draws, Ending, Spread, even_spread
 from cref_jax.robot import kinematics
 
 LENGTH = C.terrain.lane_length
@@ -59,7 +60,7 @@ def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obsta
     world, fresh_states
 ):
     c = config.override(C, {"episode": {"start_anywhere": 0.5}})
-    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0)))
+    reset = jax.jit(jax.vmap(resets.reset, in_axes=(None, 0, 0, 0)))
     keys = jax.random.split(jax.random.key(3), 512)
     state = reset(world.replace(config=c), keys, fresh_states.kind, jnp.full(512, 2))
     x, kinds = np.asarray(state.body.qpos[:, 0]), np.array(world.lanes.kinds)[state.kind]
@@ -84,10 +85,10 @@ def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obsta
 def test_half_of_the_randomisation_is_half_as_wide(world, fresh_states):
     kinds, levels = fresh_states.kind, fresh_states.level
     keys = jax.random.split(jax.random.key(3), 512)  # those of `fresh_states`
-    reset = jax.jit(jax.vmap(episode.reset, in_axes=(None, 0, 0, 0, None)))
+    reset = jax.jit(jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, None)))
     nominal = world.physics.nominal_dynamics()
     for share in (0.0, 0.5):
-        state = reset(world, keys, kinds, levels, episode.evenly(share))
+        state = reset(world, keys, kinds, levels, even_spread(share))
         for part, whole, middle in zip(
             *map(jax.tree.leaves, (state.dynamics, fresh_states.dynamics, nominal)), strict=True
         ):
@@ -123,17 +124,17 @@ def test_drawn_dynamics_stay_in_their_ranges_and_fill_them(world, fresh_states):
 
 def test_without_randomisation_every_robot_is_the_nominal_one(world):
     c = config.override(C, {"randomisation": {"enabled": False}})
-    state = episode.reset(world.replace(config=c), jax.random.key(0), jnp.int32(1), jnp.int32(0))
+    state = resets.reset(world.replace(config=c), jax.random.key(0), jnp.int32(1), jnp.int32(0))
     assert_equal(state.dynamics, world.physics.nominal_dynamics())
     assert not state.joint_offset.any() and int(state.delay) == 0
 
 
-@pytest.mark.parametrize("part", [*episode.Spread._fields, None])
+@pytest.mark.parametrize("part", [*Spread._fields, None])
 def test_each_part_is_randomised_alone(world, part):
-    share = episode.Spread(*(jnp.float32(name == part) for name in episode.Spread._fields))
+    share = Spread(*(jnp.float32(name == part) for name in Spread._fields))
     keys = jax.random.split(jax.random.key(6), 32)
-    reset = jax.vmap(episode.reset, in_axes=(None, 0, None, None, None))
-    nominal = reset(world, keys, jnp.int32(1), jnp.int32(0), episode.evenly(0.0))
+    reset = jax.vmap(resets.reset, in_axes=(None, 0, None, None, None))
+    nominal = reset(world, keys, jnp.int32(1), jnp.int32(0), even_spread(0.0))
     state = reset(world, keys, jnp.int32(1), jnp.int32(0), share)
     fields = {
         "friction": lambda s: s.dynamics.friction,
@@ -150,10 +151,10 @@ def test_each_part_is_randomised_alone(world, part):
                 assert (a != b).mean() > 0.7
         else:
             assert_equal(field(state), field(nominal))
-    shoved = jax.vmap(episode.pushed, in_axes=(None, 0, None))
+    shoved = jax.vmap(events.apply_push, in_axes=(None, 0, None))
     due, draw = state.replace(push_left=jnp.zeros(32, jnp.int32)), jnp.array([0.5, -0.3])
     none = jnp.int32(0)
-    draws = episode.Draws(draw, none, jnp.zeros(3), jnp.array(False), none)
+    draws = Draws(draw, none, jnp.zeros(3), jnp.array(False), none)
     gained = shoved(world, due, draws).body.qvel - state.body.qvel
     np.testing.assert_allclose(gained[:, :2], jnp.tile(draw * (part == "pushes"), (32, 1)))
 
@@ -183,7 +184,7 @@ def test_on_a_lane_most_commands_go_forward_and_on_open_ground_anywhere(world, f
 
 def test_parts_of_a_command_in_the_open_are_0_at_times(world, fresh_states):
     c = config.override(C, {"command": {"zero": 0.5, "standing": 0.0}})
-    draw = jax.vmap(episode._drawn_command, in_axes=(None, 0, None))
+    draw = jax.vmap(commands.sample_command, in_axes=(None, 0, None))
     keys, flat = jax.random.split(jax.random.key(4), 2000), world.lanes.kinds.index("flat")
     command, _ = draw(world.replace(config=c), keys, jnp.int32(flat))
     is_zero = np.asarray(command) == 0.0
@@ -197,12 +198,12 @@ def test_parts_of_a_command_in_the_open_are_0_at_times(world, fresh_states):
 
 
 def commanded(world, state, seed=0):
-    draws = episode.draw(world, state, jax.random.key(9), jax.random.key(seed))
-    return episode.commanded(world, state, draws)
+    draws = events.draw(world, state, jax.random.key(9), jax.random.key(seed))
+    return commands.update_command(world, state, draws)
 
 
 def pushed(world, state, key):
-    return episode.pushed(world, state, episode.draw(world, state, key, jax.random.key(9)))
+    return events.apply_push(world, state, events.draw(world, state, key, jax.random.key(9)))
 
 
 @pytest.mark.parametrize(
@@ -303,7 +304,7 @@ def test_nobody_is_pushed_without_randomisation(world, robots):
 def causes():
     world = sample.world()
     judge = jax.jit(
-        lambda state: episode.ending(
+        lambda state: terminations.check_termination(
             world, state, world.physics.links(state.body), jnp.zeros((), bool)
         )
     )
@@ -385,7 +386,7 @@ def test_who_was_told_to_stand_in_between_has_not_stalled(causes, robots):
 def test_a_look_is_noted(world, robots):
     state = put(one(robots), x=3.0).replace(commanded=jnp.float32(2.5))
     for step, expected in ((250, [3.0, 2.5]), (251, np.asarray(state.mark))):
-        found = episode.marked(world, state.replace(step=jnp.int32(step))).mark
+        found = terminations.record_progress(world, state.replace(step=jnp.int32(step))).mark
         np.testing.assert_allclose(found, expected)
 
 
@@ -431,7 +432,7 @@ def test_a_lane_is_only_passed_from_its_start(world, robots):
         rank=jnp.int32(0), commanded=jnp.float32(9.0)
     )
     for start, expected in ((0.9, 1), (6.0, 0)):
-        rank, _ = episode.promoted(
+        rank, _ = curriculum.next_level(
             world, state.replace(start=jnp.array([start, 0.0])), over, jax.random.key(0)
         )
         assert int(rank) == expected
@@ -441,9 +442,11 @@ def test_no_more_is_asked_for_than_the_lane_is_long(world, robots):
     # 1 m/s for 20 s is 20 m, the way from 0.75 m to the finish at 11 m is 10.25 m
     state = one(robots).replace(command=jnp.array([1.0, 0.0, 0.0]), start=jnp.array([0.75, 0.0]))
     state = state.replace(is_steered=jnp.array(True))
-    assert float(episode._asked(world, state)) == pytest.approx(10.25)
+    assert float(curriculum._commanded_distance(world, state)) == pytest.approx(10.25)
     slow = state.replace(command=jnp.array([0.3, 0.4, 0.0]), step=jnp.int32(500))
-    assert float(episode._asked(world, slow)) == pytest.approx(5.0)  # 0.5 m/s for 10 s
+    assert float(curriculum._commanded_distance(world, slow)) == pytest.approx(
+        5.0
+    )  # 0.5 m/s for 10 s
 
 
 def after(world, robots, walked, commanded, level, rank, cause, review, key=0):
@@ -461,7 +464,7 @@ def after(world, robots, walked, commanded, level, rank, cause, review, key=0):
     )
     state = put(state, x=state.start[0] + walked)
     over = Ending(*(jnp.array(name == cause) for name in Ending._fields))
-    return episode.promoted(world.replace(config=c), state, over, jax.random.key(key))
+    return curriculum.next_level(world.replace(config=c), state, over, jax.random.key(key))
 
 
 def test_an_easy_level_neither_wins_nor_costs_a_rank(world, robots):
@@ -488,4 +491,4 @@ def test_without_a_curriculum_the_level_stays(world, robots):
     fixed = world.replace(config=config.override(C, {"curriculum": {"enabled": False}}))
     state = put(one(robots).replace(level=jnp.int32(1)), x=11.0)
     over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
-    assert int(episode.promoted(fixed, state, over, jax.random.key(0))[1]) == 1
+    assert int(curriculum.next_level(fixed, state, over, jax.random.key(0))[1]) == 1

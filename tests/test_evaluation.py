@@ -5,7 +5,7 @@ import pytest
 
 from cref_jax import evaluation
 from cref_jax.config import Config, override
-from cref_jax.episode import Ending
+from cref_jax.env.state import Ending
 from cref_jax.evaluation import _judged, _Step
 
 

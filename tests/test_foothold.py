@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cref_jax import config, foothold, geometry, robot, terrain
+from cref_jax import config, geometry, robot, terrain
+from cref_jax.env import footholds
 from cref_jax.robot import kinematics
 from cref_jax.terrain import lanes
 
@@ -20,13 +21,13 @@ ACROSS = 0.007  # m, y of the soles: no point of the buffer lies on the border o
 
 AS_SHIPPED = {"xla_backend_optimization_level": 3}  # its rounding is what is measured here
 windows = jax.jit(
-    lambda z, c=C: foothold.windows(z, c), static_argnums=1, compiler_options=AS_SHIPPED
+    lambda z, c=C: footholds.windows(z, c), static_argnums=1, compiler_options=AS_SHIPPED
 )
 
 
 @jax.jit
 def candidates(ground, sole, heading, command):
-    return foothold.candidates(ground, sole, heading, command, C)
+    return footholds.candidates(ground, sole, heading, command, C)
 
 
 def lane(height_of_x) -> terrain.Terrain:
@@ -112,7 +113,7 @@ def test_steep_and_rough_ground_has_the_eigenvalues_of_eigh():
 def test_the_ground_of_a_lane_has_the_eigenvalues_of_eigh(kind, size):
     ground = lanes.single(config.Terrain(name="mixed"), kind, size).tile(0, 0)
     for x in (1.3, 2.017, 3.9):
-        grid = np.stack(np.meshgrid(*foothold._lattice(C), indexing="ij"), -1)
+        grid = np.stack(np.meshgrid(*footholds._lattice(C), indexing="ij"), -1)
         points = jnp.array([x, 0.003]) + geometry.rotate_yaw(jnp.float32(0.3), jnp.asarray(grid))
         agrees(terrain.height_at(ground, points))
 
@@ -126,7 +127,7 @@ def test_level_ground_is_smooth_and_vertical(level):
 
 def test_a_slope_is_smooth():
     # z = 0.4 x - 0.3 y: normal ~ (-0.4, 0.3, 1), |v_z| = 1 / sqrt(1.25) = 0.8944
-    x, y = foothold._lattice(C)
+    x, y = footholds._lattice(C)
     found = windows(jnp.asarray(0.5 + 0.4 * x[:, None] - 0.3 * y))
     assert float(found.roughness.max()) < 1e-4
     np.testing.assert_allclose(found.verticality, 1.0 / math.sqrt(1.25), atol=1e-5)
@@ -205,7 +206,7 @@ def test_with_the_gate_on_windows_those_with_a_point_that_is_too_near_go():
     # 0.21 for k = 5. 0.8 m/s: 0.4 m, 0.37 for k = 9 and 0.41 for k = 10
     c = dataclasses.replace(C, gate="windows")
     ground, zero = lane(lambda x: 0.0), jnp.zeros(2)
-    found = lambda command: foothold.candidates(ground, soles(), zero, jnp.float32(command), c)
+    found = lambda command: footholds.candidates(ground, soles(), zero, jnp.float32(command), c)
     check(found(0.4), range(5, 25), 0.0)
     check(found(0.8), range(10, 25), 0.0)
     check(found(-1.0), range(25), 0.0)
@@ -240,20 +241,20 @@ def test_the_next_tread_is_a_candidate_at_walking_speed():
     # gate on windows leaves none before the tread after it, whose middle is at 0.60
     ground = lane(lambda x: 0.2 * max(0.0, math.floor((x + 0.15) / 0.3)))
     middle = soles(x=0.30, z=0.2)
-    nearest = lambda found: float(foothold.distance(found, middle)[0])
+    nearest = lambda found: float(footholds.distance(found, middle)[0])
     assert nearest(ahead(ground, command=0.6)) < 0.05
     c = dataclasses.replace(C, gate="windows")
-    whole = foothold.candidates(ground, soles(), jnp.zeros(2), jnp.float32(0.6), c)
+    whole = footholds.candidates(ground, soles(), jnp.zeros(2), jnp.float32(0.6), c)
     assert nearest(whole) > 0.25
 
 
 def test_a_window_of_remaining_points_has_the_eigenvalues_of_eigh():
     z = np.random.default_rng(3).normal(0.0, 0.02, (60, 5)).astype(np.float32)
-    x, y = foothold._lattice(C)
-    remain = x[foothold._rows(C)] >= 0.45  # m; row 22 is the first
-    found = foothold._windows([jnp.asarray(z[:, j]) for j in range(5)], remain, C)
+    x, y = footholds._lattice(C)
+    remain = x[footholds._rows(C)] >= 0.45  # m; row 22 is the first
+    found = footholds._windows([jnp.asarray(z[:, j]) for j in range(5)], remain, C)
     for k in range(6, 25):  # of window 6 two rows are left
-        rows = foothold._rows(C)[k][remain[k]]
+        rows = footholds._rows(C)[k][remain[k]]
         points = np.stack([*np.meshgrid(x[rows], y, indexing="ij"), z[rows]], -1).reshape(-1, 3)
         size, v = np.linalg.eigh(np.cov(points.astype(np.float64).T))
         np.testing.assert_allclose(found.roughness[k], math.sqrt(size[0]), rtol=1e-3)
@@ -306,8 +307,8 @@ def test_turning_and_shifting_robot_and_ground_changes_nothing():
     np.testing.assert_allclose(after.z, before.z, atol=1e-6)
     step = np.array([0.4, 0.05, 0.02])  # m, the same for both
     spun = np.array([-0.05, 0.4, 0.02])
-    here = foothold.distance(before, jnp.asarray(sole + step, jnp.float32))
-    there = foothold.distance(after, jnp.asarray(moved + spun, jnp.float32))
+    here = footholds.distance(before, jnp.asarray(sole + step, jnp.float32))
+    there = footholds.distance(after, jnp.asarray(moved + spun, jnp.float32))
     np.testing.assert_allclose(there, here, atol=1e-4)
 
 
@@ -316,11 +317,11 @@ def test_candidates_stay_during_the_swing_and_are_new_on_the_ground():
     before = ahead(stairs)
     now = ahead(stairs, command=0.6, sole=soles(x=0.31, z=0.2), heading=0.4)
     touchdown = soles(x=0.45, z=0.15)
-    held = foothold.updated(before, now, jnp.array([False, False]))
+    held = footholds.update_candidates(before, now, jnp.array([False, False]))
     jax.tree.map(np.testing.assert_array_equal, held, before)
     # window 8 is at x = 0.44: 1 cm off, wherever the foot has been since
-    np.testing.assert_allclose(foothold.distance(held, touchdown), 0.01, atol=1e-6)
-    left = foothold.updated(before, now, jnp.array([True, False]))
+    np.testing.assert_allclose(footholds.distance(held, touchdown), 0.01, atol=1e-6)
+    left = footholds.update_candidates(before, now, jnp.array([True, False]))
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), left, now)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1], b[1]), left, before)
     assert (left.accepted[0] != left.accepted[1]).any() and (left.origin[0] != left.origin[1]).any()
@@ -329,7 +330,7 @@ def test_candidates_stay_during_the_swing_and_are_new_on_the_ground():
 def test_distance_is_in_the_plane_of_the_liftoffs_heading():
     # heading 90 degrees from (1, 2, 3): the candidate 0.4 ahead and 0.1 up is at (1, 2.4, 3.1).
     # (1.3, 2.46, 3.02) is 0.06 further along and 0.08 lower, sqrt(...) = 0.1; the 0.3 are across
-    frozen = foothold.none(C).replace(
+    frozen = footholds.no_candidates(C).replace(
         x=jnp.full((2, 25), 0.4),
         z=jnp.full((2, 25), 0.1),
         accepted=jnp.zeros((2, 25), bool).at[:, 7].set(True),
@@ -337,34 +338,34 @@ def test_distance_is_in_the_plane_of_the_liftoffs_heading():
         heading=jnp.full(2, math.pi / 2),
     )
     at = lambda x: jnp.broadcast_to(jnp.array([x, 2.46, 3.02]), (2, 3))
-    np.testing.assert_allclose(foothold.distance(frozen, at(1.3)), 0.1, atol=1e-6)
-    np.testing.assert_allclose(foothold.distance(frozen, at(0.2)), 0.1, atol=1e-6)
+    np.testing.assert_allclose(footholds.distance(frozen, at(1.3)), 0.1, atol=1e-6)
+    np.testing.assert_allclose(footholds.distance(frozen, at(0.2)), 0.1, atol=1e-6)
 
 
 def test_the_nearest_accepted_candidate_counts():
     # before the gap windows are at 0.12 and 0.16, beyond it from 0.92 on: x = 0.56 is 0.36 from
     # 0.92 and 0.40 from 0.16
     found = ahead(lane(lambda x: -1.0 if 0.3 < x < 0.8 else 0.0))
-    np.testing.assert_allclose(foothold.distance(found, soles(x=0.56)), 0.36, atol=1e-6)
+    np.testing.assert_allclose(footholds.distance(found, soles(x=0.56)), 0.36, atol=1e-6)
 
 
 def test_without_a_candidate_the_distance_is_infinite_and_the_reward_0():
-    empty = foothold.none(C)
-    np.testing.assert_array_equal(foothold.distance(empty, soles()), np.inf)
+    empty = footholds.no_candidates(C)
+    np.testing.assert_array_equal(footholds.distance(empty, soles()), np.inf)
 
     def reward(sole):
-        return jnp.exp(-foothold.distance(empty, sole) / 0.08).sum()
+        return jnp.exp(-footholds.distance(empty, sole) / 0.08).sum()
 
     value, gradient = jax.value_and_grad(reward)(soles(x=0.3))
     assert float(value) == 0.0
     np.testing.assert_array_equal(gradient, 0.0)
 
 
-def feet(x=0.0, z=0.0, heading=0.0) -> foothold.Soles:
+def feet(x=0.0, z=0.0, heading=0.0) -> footholds.Soles:
     """Return feet with their ankles at `x`, the soles' centres 3.5 cm in front and 7 cm below."""
     ankle = soles(x=x, z=z + 0.07)
     centre = ankle + jnp.array([0.035, 0.0, -0.07])
-    return foothold.Soles(centre=centre, ankle=ankle, heading=jnp.full(2, heading))
+    return footholds.Soles(centre=centre, ankle=ankle, heading=jnp.full(2, heading))
 
 
 def test_the_samples_of_the_sole_over_a_gap_count():
@@ -372,10 +373,10 @@ def test_the_samples_of_the_sole_over_a_gap_count():
     # edge at 0.06 leaves two rows of three over the gap, an edge at 0.02 three, one at -1 all
     edge = lambda x: lane(lambda at: 0.0 if at < x else -1.0)
     for x, expected in [(0.06, 6), (0.02, 9), (-1.0, 15), (0.5, 0)]:
-        np.testing.assert_array_equal(foothold.unsupported(edge(x), feet(), C), expected)
+        np.testing.assert_array_equal(footholds.unsupported(edge(x), feet(), C), expected)
     # turned left the foot has all of its length on one side of the edge: 1 of 3 columns, at
     # x = +0.05, is over the gap behind 0.04
-    turned = foothold.unsupported(edge(0.04), feet(heading=math.pi / 2), C)
+    turned = footholds.unsupported(edge(0.04), feet(heading=math.pi / 2), C)
     np.testing.assert_array_equal(turned, 5)
 
 
@@ -383,7 +384,7 @@ def test_what_is_2_cm_lower_bears_and_what_is_4_cm_lower_does_not():
     # epsilon = -3 cm from the sole, not from z = 0
     ground = lane(lambda x: 0.5)
     for above, expected in [(0.02, 0), (0.04, 15), (-0.04, 0)]:
-        found = foothold.unsupported(ground, feet(z=0.5 + above), C)
+        found = footholds.unsupported(ground, feet(z=0.5 + above), C)
         np.testing.assert_array_equal(found, expected)
 
 
@@ -394,7 +395,7 @@ def test_the_soles_of_a_robot_that_stands_and_turns(actuated):
     tree = kinematics.tree(robot.spec(actuated, config.Physics()).compile())
     turn = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.float32(0.7))
     qpos = jnp.concatenate([jnp.array([3.0, -2.0, x2.standing_height]), turn, x2.nominal_pose])
-    found = foothold.soles(kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1)), x2)
+    found = footholds.soles(kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1)), x2)
     np.testing.assert_allclose(found.centre[:, 2], 0.0, atol=1e-4)
     np.testing.assert_allclose(found.heading, 0.7, atol=1e-4)
     ahead = geometry.rotate_yaw(-found.heading, found.centre - found.ankle)
@@ -412,17 +413,17 @@ def test_each_sole_has_its_own_spheres_and_heading():
     moved = x2.spheres._replace(position=(x2.spheres.position + shift).astype(np.float32))
     x2 = dataclasses.replace(x2, spheres=moved)
     links = lambda qpos: kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1))
-    found = foothold.soles(links(qpos), x2)
+    found = footholds.soles(links(qpos), x2)
     np.testing.assert_allclose((found.centre - found.ankle)[:, 0], [0.035, 0.045], atol=1e-4)
     turned = qpos.at[7 + x2.joint_names.index("left_hip_yaw_joint")].set(0.3)
-    heading = foothold.soles(links(turned), x2).heading
+    heading = footholds.soles(links(turned), x2).heading
     assert float(heading[0]) > 0.2
     np.testing.assert_allclose(heading[1], 0.0, atol=1e-5)
 
 
 def test_a_window_is_as_wide_as_the_buffer():
     with pytest.raises(ValueError, match="as wide as the buffer"):
-        foothold.windows(jnp.zeros((60, 5)), config.Foothold(window=(12, 3)))
+        footholds.windows(jnp.zeros((60, 5)), config.Foothold(window=(12, 3)))
 
 
 @pytest.mark.parametrize(
@@ -436,7 +437,7 @@ def test_a_window_is_as_wide_as_the_buffer():
 )
 def test_other_numbers_give_other_windows(c, count):
     rng = np.random.default_rng(0)
-    assert foothold.none(c).accepted.shape == (2, count)
+    assert footholds.no_candidates(c).accepted.shape == (2, count)
     for noise in (0.001, 0.01, 0.05):
         tilt = rng.uniform(-0.05, 0.05, (c.points[0], 1)) + rng.uniform(-0.05, 0.05, c.points[1])
         agrees(tilt + rng.normal(0.0, noise, c.points), c)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import gait
+from cref_jax.env import gait
 
 PERIOD = 0.02  # s
 
@@ -14,10 +14,10 @@ def walked(contacts: str, debounce: int):
 
     `contacts` has an `x` for each step in which the foot touches; the right foot always does.
     """
-    state, touchdowns, down = gait.standing(), [], []
+    state, touchdowns, down = gait.standing_gait(), [], []
     for k, mark in enumerate(contacts):
         touching = jnp.array([mark == "x", True])
-        state, swings = gait.advanced(state, touching, PERIOD, debounce)
+        state, swings = gait.update_gait(state, touching, PERIOD, debounce)
         down.append(bool(state.down[0]))
         assert not swings.touchdown[1] and float(swings.air_time[1]) == 0.0
         if swings.touchdown[0]:
@@ -53,11 +53,11 @@ def test_a_foot_is_up_from_its_second_step_without_contact_to_its_second_with_it
 
 
 def test_air_time_grows_through_a_scuff_and_is_kept_after_the_touchdown():
-    state = gait.standing()
+    state = gait.standing_gait()
     for mark in "x..x..":
-        state, _ = gait.advanced(state, jnp.array([mark == "x", True]), PERIOD, 2)
+        state, _ = gait.update_gait(state, jnp.array([mark == "x", True]), PERIOD, 2)
     np.testing.assert_allclose(state.air_time, [5 * PERIOD, 0.0], rtol=1e-6)
     for _ in range(2):
-        state, _ = gait.advanced(state, jnp.ones(2, bool), PERIOD, 2)
+        state, _ = gait.update_gait(state, jnp.ones(2, bool), PERIOD, 2)
     np.testing.assert_allclose(state.air_time, 0.0)
     np.testing.assert_allclose(state.last_air_time, [6 * PERIOD, 0.0], rtol=1e-6)

@@ -17,11 +17,11 @@ from random_policy import ROBOT, SMALL, policy
 
 from cref_jax import cli, config, exported, gaze, runs, watch
 from cref_jax.config import Config
+from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.terrain import atlas, cross_section, lanes
 from cref_jax.terrain.cross_section import DOWN, UP
 from cref_jax.watch import Moment, Watched
-from cref_jax.world import World
 
 CELL = 0.1  # m
 

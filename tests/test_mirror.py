@@ -8,7 +8,8 @@ import pytest
 import sample
 from sample import ROBOTS, C, on, one
 
-from cref_jax import config, env, learn, mirror, network, rollout
+from cref_jax import config, learn, mirror, network, rollout
+from cref_jax.env import environment
 
 MODEL_NAMES = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 SIGNS = (1, -1, -1, 1, 1, -1)
@@ -76,8 +77,8 @@ def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
         body=jax.vmap(lambda b: mirror.body(b, joints))(state.body),
         command=mirror.COMMAND * state.command,
     )
-    step = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
-    look = jax.jit(jax.vmap(env.depth_image, in_axes=(None, 0)))
+    step = jax.jit(jax.vmap(environment.step, in_axes=(None, 0, 0)))
+    look = jax.jit(jax.vmap(environment.depth_image, in_axes=(None, 0)))
     for _ in range(3):
         action = jnp.asarray(0.5 * rng.normal(size=state.action.shape), jnp.float32)
         state, real = step(world, state, action)

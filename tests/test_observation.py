@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import config, geometry, observation, terrain
+from cref_jax import config, geometry, terrain
+from cref_jax.env import observations
 
 JOINTS = 12
 CELL = 0.02  # m
@@ -27,12 +28,12 @@ def state(rotation=LEVEL, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0)):
 
 
 def test_the_parts_follow_each_other_as_in_eq_2():
-    clean = observation.motion(*state(turned([1.0, 0.0, 0.0], 90.0), spin=(1.0, 2.0, 3.0)), JOINTS)
+    clean = observations.motion(*state(turned([1.0, 0.0, 0.0], 90.0), spin=(1.0, 2.0, 3.0)), JOINTS)
     command = jnp.array([0.5, -0.1, 0.2])
     action = jnp.arange(JOINTS) + 100.0
-    found = observation.proprioception(clean, command, jnp.full(JOINTS, 0.5), action)
+    found = observations.proprioception(clean, command, jnp.full(JOINTS, 0.5), action)
     assert found.shape == (3 + 3 + 3 + 3 * JOINTS,)
-    parts = {name: found[part] for name, part in observation.slices(JOINTS).items()}
+    parts = {name: found[part] for name, part in observations.slices(JOINTS).items()}
     expected = {
         "angular_velocity": [1.0, 2.0, 3.0],
         "gravity": [0.0, -1.0, 0.0],  # lying on its right side, the left side up
@@ -47,7 +48,7 @@ def test_the_parts_follow_each_other_as_in_eq_2():
 
 
 def test_the_slices_cover_everything_once():
-    covered = np.concatenate([np.arange(100)[s] for s in observation.slices(JOINTS).values()])
+    covered = np.concatenate([np.arange(100)[s] for s in observations.slices(JOINTS).values()])
     np.testing.assert_array_equal(covered, np.arange(45))
 
 
@@ -58,13 +59,13 @@ def test_gravity_tells_the_tilt_and_not_the_heading():
     for heading in (0.0, 70.0, -120.0):
         rotation = geometry.quat_multiply(turned([0.0, 0.0, 1.0], heading), pitched)
         np.testing.assert_allclose(
-            observation.motion(*state(rotation), JOINTS).gravity, expected, atol=1e-6
+            observations.motion(*state(rotation), JOINTS).gravity, expected, atol=1e-6
         )
 
 
 def test_the_velocity_is_turned_into_the_body_frame_and_the_spin_is_there_already():
     # heading along world y: what goes along world x goes to the right, -y of the body
-    found = observation.motion(
+    found = observations.motion(
         *state(turned([0.0, 0.0, 1.0], 90.0), (1.0, 0.0, 0.5), (1, 2, 3)), JOINTS
     )
     np.testing.assert_allclose(found.velocity, [0.0, -1.0, 0.5], atol=1e-6)
@@ -83,7 +84,7 @@ def test_the_height_scan_of_a_step(ground):
     # base 0.72 m above the start; 0.72 - 0.62 = 0.1 over the ground, 0.1 - 0.15 = -0.05 over the
     # step; x runs slowly, y fast: (0.3, +-0.1), (0.8, +-0.1), (1.3, +-0.1)
     c = config.Scan(x=(-0.5, 0.5, 3), y=(-0.1, 0.1, 2))
-    found = observation.height_scan(ground, state()[0], c)
+    found = observations.height_scan(ground, state()[0], c)
     np.testing.assert_allclose(found, [0.1, 0.1, 0.1, 0.1, -0.05, -0.05], atol=1e-6)
 
 
@@ -93,19 +94,19 @@ def test_the_height_scan_turns_with_the_heading_and_not_with_the_tilt(ground):
     heading = turned([0.0, 0.0, 1.0], 90.0)
     for tilt in (0.0, 25.0):
         rotation = geometry.quat_multiply(heading, turned([0.0, 1.0, 0.0], tilt))
-        found = observation.height_scan(ground, state(rotation)[0], c)
+        found = observations.height_scan(ground, state(rotation)[0], c)
         np.testing.assert_allclose(found, [-0.05, 0.1, -0.05, 0.1], atol=1e-6)
 
 
 def test_the_height_scan_is_clipped(ground):
     # over the pit: 0.72 + 1 - 0.62 = 1.1, cut to 1
     c = config.Scan(x=(1.5, 1.5, 1), y=(0.0, 0.0, 1))
-    np.testing.assert_array_equal(observation.height_scan(ground, state()[0], c), [1.0])
+    np.testing.assert_array_equal(observations.height_scan(ground, state()[0], c), [1.0])
 
 
 def test_the_critic_sees_the_clean_observation_the_velocity_the_hidden_and_last_the_heights():
     parts = (jnp.arange(45.0), jnp.arange(3) + 50.0, jnp.arange(2) + 55.0, jnp.arange(6) + 60.0)
-    found = observation.privileged(*parts)
+    found = observations.privileged(*parts)
     np.testing.assert_array_equal(found, [*range(45), 50, 51, 52, 55, 56, *range(60, 66)])
 
 
@@ -115,14 +116,14 @@ def test_the_fine_row_places_a_riser_within_its_spacing():
     heights = np.where((np.arange(200) + 0.5) * 0.02 > 0.99, 0.2, 0.0)[:, None]
     ground = terrain.from_heights(heights, 0.02, (0.0, 0.0))
     qpos = jnp.zeros(19).at[:4].set(jnp.array([0.3, 0.0, 0.62, 1.0]))
-    found = observation.fine_row(ground, qpos, config.Scan())
+    found = observations.fine_row(ground, qpos, config.Scan())
     np.testing.assert_allclose(found, [*[0.0] * 18, *[-0.2] * 7], atol=1e-6)
 
 
 def test_noise_stays_within_its_bounds_and_reaches_them():
     c = config.Randomisation()
-    clean = observation.motion(*state(velocity=(1.0, 2.0, 3.0)), JOINTS)
-    noisy = jax.vmap(lambda key: observation.with_noise(clean, c, 1.0, key))(
+    clean = observations.motion(*state(velocity=(1.0, 2.0, 3.0)), JOINTS)
+    noisy = jax.vmap(lambda key: observations.with_noise(clean, c, 1.0, key))(
         jax.random.split(jax.random.key(0), 2000)
     )
     bounds = {

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import config, reward, robot
+from cref_jax import config, robot
+from cref_jax.env import rewards
 
 C = config.Reward()
 PERIOD = 0.02  # s
@@ -47,11 +48,11 @@ def x2() -> robot.Robot:
     return robot.load(config.Robot())
 
 
-def perfect(x2: robot.Robot) -> reward.Snapshot:
+def perfect(x2: robot.Robot) -> rewards.Snapshot:
     """Stand as Table I wants it: every reward is 1 and every penalty 0."""
     still = jnp.zeros(3)
     joints = jnp.zeros(len(x2.joint_names))
-    return reward.Snapshot(
+    return rewards.Snapshot(
         velocity=still,
         angular_velocity=still,
         gravity=jnp.array([0.0, 0.0, -1.0]),
@@ -77,7 +78,7 @@ def perfect(x2: robot.Robot) -> reward.Snapshot:
     )
 
 
-def walking(x2: robot.Robot) -> reward.Snapshot:
+def walking(x2: robot.Robot) -> rewards.Snapshot:
     """Walk at 0.6 m/s as Table I wants it."""
     ahead = jnp.array([0.6, 0.0, 0.0])
     return perfect(x2)._replace(velocity=ahead, command=ahead, since_single=jnp.float32(0.0))
@@ -100,14 +101,14 @@ def check(x2: robot.Robot, name: str, expected: float, **changes) -> None:
     snapshot = like._replace(
         **{k: jnp.asarray(v, getattr(like, k).dtype) for k, v in changes.items()}
     )
-    found = reward.TERMS[name](snapshot, C, x2)
+    found = rewards.TERMS[name](snapshot, C, x2)
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
 
 
 def test_a_row_a_function_and_a_weight_have_one_name():
     fields = [f.name for f in dataclasses.fields(config.RewardWeights)]
-    assert sorted(reward.TERMS) == sorted(fields)
-    assert set(reward.TERMS) == set(TABLE_1 | ALTERNATIVES)
+    assert sorted(rewards.TERMS) == sorted(fields)
+    assert set(rewards.TERMS) == set(TABLE_1 | ALTERNATIVES)
 
 
 def test_the_weights_are_those_of_table_1():
@@ -135,15 +136,15 @@ def test_foothold_missed(x2):
 def test_footholds_can_weigh_more_without_paying_for_more_steps(x2):
     # with weights 2 and -4 a perfect step is worth 2, and 8 cm beside costs three times as much
     weigh = lambda d, placed, missed: float(
-        placed * reward.foothold_placement(stepped(x2, d), C, x2)
-        + missed * reward.foothold_missed(stepped(x2, d), C, x2)
+        placed * rewards.foothold_placement(stepped(x2, d), C, x2)
+        + missed * rewards.foothold_missed(stepped(x2, d), C, x2)
     )
     assert weigh(0.0, 2.0, -4.0) == weigh(0.0, 2.0, 0.0) == 2.0
     cost = lambda missed: weigh(0.0, 2.0, missed) - weigh(0.08, 2.0, missed)
     assert cost(-4.0) == pytest.approx(3.0 * cost(0.0))
 
 
-def stepped(x2: robot.Robot, distance: float) -> reward.Snapshot:
+def stepped(x2: robot.Robot, distance: float) -> rewards.Snapshot:
     """Put one foot down so far from its nearest candidate."""
     down = jnp.array([True, False])
     return walking(x2)._replace(first_contact=down, foothold_distance=jnp.full(2, distance))
@@ -340,7 +341,7 @@ def test_stumble(x2):
 
 
 def test_a_perfect_stand_has_every_reward_and_no_penalty(x2):
-    _, parts = reward.total(perfect(x2), C, x2)
+    _, parts = rewards.total(perfect(x2), C, x2)
     weights = TABLE_1 | ALTERNATIVES | {"foothold_placement": 0.0}  # no foot comes down
     expected = {name: max(weight, 0.0) for name, weight in weights.items()}
     assert {name: pytest.approx(float(v), abs=1e-6) for name, v in parts.items()} == expected
@@ -354,7 +355,7 @@ def test_the_sum_is_scaled_by_the_period_and_cut_at_zero(x2, times_dt, clip_at_z
     # 2.5 + 1.5 + 1 + 1.5 + 0.1 + 0.8 = 7.4, less 3^2 is -1.6; in 0.02 s that is -0.032
     c = dataclasses.replace(C, times_dt=times_dt, clip_at_zero=clip_at_zero)
     snapshot = perfect(x2)._replace(velocity=jnp.array([0.0, 0.0, 3.0]))
-    found, parts = reward.total(snapshot, c, x2)
+    found, parts = rewards.total(snapshot, c, x2)
     np.testing.assert_allclose(found, expected, atol=1e-6)
     assert float(parts["linear_velocity_z"]) == -9.0  # the log keeps it, whatever becomes of it
 
@@ -366,10 +367,10 @@ def test_a_touchdown_counts_for_its_own_time(x2):
         air_time=jnp.array([0.3, PERIOD]),
         foothold_distance=jnp.array([0.0, jnp.inf]),
     )
-    found, parts = reward.total(landing, C, x2)
+    found, parts = rewards.total(landing, C, x2)
     assert float(found) == pytest.approx(0.523)
     assert float(parts["foothold_placement"]) == pytest.approx(2.0 * 0.25 / 0.02)
-    raw, _ = reward.total(landing, dataclasses.replace(C, times_dt=False), x2)
+    raw, _ = rewards.total(landing, dataclasses.replace(C, times_dt=False), x2)
     assert float(raw) == pytest.approx(7.4 + 2.0 - 0.5)
 
 
@@ -380,7 +381,7 @@ def landed(x2, air_time: float, velocity_z: float = 0.0) -> float:
         air_time=jnp.array([air_time, 0.0]),
         velocity=jnp.array([0.6, 0.0, velocity_z]),
     )
-    return float(reward.total(landing, C, x2)[0])
+    return float(rewards.total(landing, C, x2)[0])
 
 
 def test_the_cut_leaves_touchdowns_alone(x2):
@@ -394,7 +395,7 @@ def test_a_cut_that_takes_touchdowns_in_makes_short_steps_free(x2):
         first_contact=jnp.array([True, False]), velocity=jnp.array([0.6, 0.0, 3.0])
     )
     c = dataclasses.replace(C, clip_touchdowns=True)
-    assert float(reward.total(landing, c, x2)[0]) == 0.0
+    assert float(rewards.total(landing, c, x2)[0]) == 0.0
 
 
 def test_two_equal_steps_never_earn_less_than_one_long_and_one_short(x2):
@@ -414,12 +415,12 @@ def test_a_touchdown_counts_for_nothing_while_standing_is_commanded(x2):
         air_time=jnp.array([0.3, 0.7]),
         foothold_distance=jnp.zeros(2),
     )
-    (of_step, parts), (of_still, _) = (reward.total(s, C, x2) for s in (stepping, still))
+    (of_step, parts), (of_still, _) = (rewards.total(s, C, x2) for s in (stepping, still))
     assert float(of_step) == float(of_still)
-    assert all(float(parts[name]) == 0.0 for name in reward.EVENTS)
+    assert all(float(parts[name]) == 0.0 for name in rewards.EVENTS)
 
 
 def test_a_positive_sum_passes_the_cut(x2):
     # (7.4 - 2^2) * 0.02 = 0.068
-    found, _ = reward.total(perfect(x2)._replace(velocity=jnp.array([0.0, 0.0, 2.0])), C, x2)
+    found, _ = rewards.total(perfect(x2)._replace(velocity=jnp.array([0.0, 0.0, 2.0])), C, x2)
     np.testing.assert_allclose(found, 0.068, rtol=1e-5)

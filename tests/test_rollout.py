@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import sample
 
-from cref_jax import config, depth, env, learn, ppo, rollout
+from cref_jax import config, depth, learn, ppo, rollout
 from cref_jax.config import Config
+from cref_jax.env import environment
 
 E, T = 4, 12
 
@@ -84,7 +85,7 @@ def test_a_frame_shows_the_robot_one_control_step_before(seeing):
     state = before
     period = world.config.physics.control_period
     advance = jax.jit(rollout.advance)
-    expose = jax.jit(jax.vmap(env.depth_image, in_axes=(None, 0)))
+    expose = jax.jit(jax.vmap(environment.depth_image, in_axes=(None, 0)))
     came = 0
     for _ in range(8):
         action = jnp.zeros((E, state.env.action.shape[-1]))

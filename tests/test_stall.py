@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from cref_jax import stall
+from cref_jax.env import stall
 
 PERIOD = 0.5  # s, so that 10 s are 20 steps
 

@@ -8,9 +8,10 @@ import pytest
 from random_policy import ROBOT, contents, policy
 from sample import put
 
-from cref_jax import deploy, depth, env, episode, evaluation, sim2sim, stand_in, terrain
+from cref_jax import deploy, depth, evaluation, sim2sim, stand_in, terrain
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
+from cref_jax.env import commands, environment, events
 from cref_jax.physics.records import Body
 from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
@@ -65,7 +66,7 @@ def test_it_sees_what_the_robot_sees_in_training():
         robot = robot.replace(
             body=robot.body._replace(qpos=robot.body.qpos.at[7:].set(world.physics.robot.rest_pose))
         )
-        seen = jax.jit(env.depth_image)(world, robot)
+        seen = jax.jit(environment.depth_image)(world, robot)
         metres = (np.asarray(seen) + 0.5) * C.camera.d_max
         held = np.minimum(np.where(np.isfinite(ours), ours, np.inf), C.camera.d_max)
         assert np.mean(np.abs(metres - held) < 0.01) > 0.99
@@ -76,8 +77,8 @@ def test_the_operator_steers_as_in_training():
     world = gap_world()
     state = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
     state = state.replace(command_left=jnp.int32(1000))
-    command = jax.jit(episode.commanded)
-    draws = jax.jit(episode.draw)(world, state, jax.random.key(0), jax.random.key(1))
+    command = jax.jit(commands.update_command)
+    draws = jax.jit(events.draw)(world, state, jax.random.key(0), jax.random.key(1))
     for y, angle in [(0.0, 0.0), (0.8, 0.3), (-3.0, 0.5), (0.2, 3.0), (0.0, -3.1)]:
         rotation = jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
         there = put(state, y=y, rotation=rotation)

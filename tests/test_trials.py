@@ -11,7 +11,7 @@ from sample import assert_equal, one
 
 from cref_jax import config, evaluation, rollout, table, trials
 from cref_jax.config import Config
-from cref_jax.episode import Ending
+from cref_jax.env.state import Ending
 from cref_jax.physics.simulation import Physics
 from cref_jax.trials import ENDINGS, Trace
 

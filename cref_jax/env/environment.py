@@ -11,13 +11,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from cref_jax import config, depth, episode, foothold, gait, geometry, observation, reward, terrain
-from cref_jax.episode import Ending, EnvState
-from cref_jax.foothold import Soles
-from cref_jax.observation import Observation
+from cref_jax import config, depth, geometry, terrain
+from cref_jax.env import (
+    commands,
+    curriculum,
+    events,
+    footholds,
+    gait,
+    observations,
+    resets,
+    rewards,
+    terminations,
+)
+from cref_jax.env.footholds import Soles
+from cref_jax.env.observations import Observation
+from cref_jax.env.state import Draws, Ending, EnvState
+from cref_jax.env.world import World
 from cref_jax.physics.records import Body
 from cref_jax.robot.kinematics import Links
-from cref_jax.world import World
 
 FAR = 1.0  # m, of a foothold, for the critic; assumed: beyond, the reward is nothing
 
@@ -53,26 +64,26 @@ class Outcome(NamedTuple):
 def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     """Return what the robot and the critic see in this state."""
     c, robot = world.config, world.physics.robot
-    clean = observation.motion(state.body.qpos, state.body.qvel, state.action.size)
+    clean = observations.motion(state.body.qpos, state.body.qvel, state.action.size)
     sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
     if c.randomisation.enabled:
-        sensed = observation.with_noise(sensed, c.randomisation, state.spread.noise, key)
-    see = lambda m: observation.proprioception(
+        sensed = observations.with_noise(sensed, c.randomisation, state.spread.noise, key)
+    see = lambda m: observations.proprioception(
         m, state.command, jnp.asarray(robot.nominal_pose), state.action
     )
-    scan = observation.height_scan(_ground(world, state), state.body.qpos, c.scan)
-    hidden = _hidden(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
+    scan = observations.height_scan(_ground(world, state), state.body.qpos, c.scan)
+    hidden = _hidden_state(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),
-        privileged=observation.privileged(see(clean), clean.velocity, hidden, scan),
+        privileged=observations.privileged(see(clean), clean.velocity, hidden, scan),
         velocity=clean.velocity,
     )
 
 
-def _hidden(world: World, state: EnvState) -> Float[Array, " H"]:
+def _hidden_state(world: World, state: EnvState) -> Float[Array, " H"]:
     """Gather what else decides rewards and motion: phases, footholds, a_{t-2}, what was drawn."""
     gait, dynamics = state.gait, state.dynamics
-    row = observation.fine_row(_ground(world, state), state.body.qpos, world.config.scan)
+    row = observations.fine_row(_ground(world, state), state.body.qpos, world.config.scan)
     numbers = (state.since_single, dynamics.friction, dynamics.payload, state.delay)
     parts = (
         *(gait.down, gait.air_time, gait.last_air_time, state.foothold_distance),
@@ -87,8 +98,8 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
     A new command comes after the reward, so the reward is for the command that the policy has seen.
     """
     keys = jax.random.split(state.key, 6)
-    draws = episode.draw(world, state, keys[1], keys[2])
-    return _renewed(world, *_advanced(world, state, action, keys, draws))
+    draws = events.draw(world, state, keys[1], keys[2])
+    return _reset_if_over(world, *_step_without_reset(world, state, action, keys, draws))
 
 
 def step_all(
@@ -101,14 +112,14 @@ def step_all(
     """
     keys = jax.vmap(lambda key: jax.random.split(key, 6))(state.key)
     each = functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
-    drawn = lambda: each(episode.draw)(world, state, keys[:, 1], keys[:, 2])
+    drawn = lambda: each(events.draw)(world, state, keys[:, 1], keys[:, 2])
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(drawn))
-    due = jax.vmap(episode.needs_draws, in_axes=(None, 0))(world, state)
+    due = jax.vmap(events.is_draw_due, in_axes=(None, 0))(world, state)
     draws = jax.lax.cond(jnp.any(due), drawn, lambda: none)
-    advance = jax.vmap(_advanced, in_axes=(None, 0, 0, 0, 0))
+    advance = jax.vmap(_step_without_reset, in_axes=(None, 0, 0, 0, 0))
     reached = advance(world, state, action, keys, draws)
     ending = reached.outcome.ending
-    renew = lambda: each(_renewed)(world, *reached)
+    renew = lambda: each(_reset_if_over)(world, *reached)
     keep = lambda: (reached.state, reached.outcome)
     return jax.lax.cond(jnp.any(ending.terminated | ending.truncated), renew, keep)
 
@@ -121,51 +132,53 @@ class _Reached(NamedTuple):
     keys: Shaped[Array, "3 ..."]  # for the next level, the reset and the first observation
 
 
-def _advanced(
+def _step_without_reset(
     world: World,
     state: EnvState,
     action: Float[Array, " J"],
     keys: Shaped[Array, "6 ..."],
-    draws: episode.Draws,
+    draws: Draws,
 ) -> _Reached:
     """Return the state that a step leads to, as if the episode went on, and what it gives."""
     c = world.config
-    state = episode.pushed(world, state.replace(key=keys[0]), draws)
+    state = events.apply_push(world, state.replace(key=keys[0]), draws)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
     targets = jnp.stack([_target(world, state, state.action), _target(world, state, action)])
     body, force = world.physics.step(
         _ground(world, state), state.body, targets, state.delay, state.dynamics
     )
-    unstable = _blown_up(body, c.physics)
+    unstable = _is_unstable(body, c.physics)
     body = jax.tree.map(lambda new, old: jnp.where(unstable, old, new), body, state.body)
     force = jnp.where(unstable, 0.0, force)
 
     links = world.physics.links(body)
-    soles = foothold.soles(links, world.physics.robot)
-    touching = reward.is_touching(force, c.reward)
-    feet, swings = gait.advanced(state.gait, touching, c.physics.control_period, c.reward.debounce)
+    soles = footholds.soles(links, world.physics.robot)
+    touching = rewards.is_touching(force, c.reward)
+    feet, swings = gait.update_gait(
+        state.gait, touching, c.physics.control_period, c.reward.debounce
+    )
     state = state.replace(gait=feet)
-    snapshot = _snapshot(world, state, body, links, soles, force, swings, action)
-    lived = _lived(world, state, body, soles, snapshot)
-    gained, terms = reward.total(snapshot, c.reward, world.physics.robot)
-    ending = episode.ending(world, lived, links, unstable)
+    snapshot = _reward_snapshot(world, state, body, links, soles, force, swings, action)
+    lived = _next_state(world, state, body, soles, snapshot)
+    gained, terms = rewards.total(snapshot, c.reward, world.physics.robot)
+    ending = terminations.check_termination(world, lived, links, unstable)
     measures = _measures(lived, snapshot, terms)
-    lived = episode.commanded(world, episode.marked(world, lived), draws)
+    lived = commands.update_command(world, terminations.record_progress(world, lived), draws)
     last = observe(world, lived, keys[5])
 
     gained = jnp.where(unstable, 0.0, gained)
     return _Reached(lived, Outcome(last, last.privileged, gained, ending, measures), keys[3:])
 
 
-def _renewed(
+def _reset_if_over(
     world: World, lived: EnvState, outcome: Outcome, keys: Shaped[Array, "3 ..."]
 ) -> tuple[EnvState, Outcome]:
     """Put the robot on a lane again if its episode is over, and observe it there."""
     key_level, key_reset, key_see = keys
     done = outcome.ending.terminated | outcome.ending.truncated
-    rank, level = episode.promoted(world, lived, outcome.ending, key_level)
-    fresh = episode.reset(world, key_reset, lived.kind, level, lived.spread).replace(rank=rank)
+    rank, level = curriculum.next_level(world, lived, outcome.ending, key_level)
+    fresh = resets.reset(world, key_reset, lived.kind, level, lived.spread).replace(rank=rank)
     first = observe(world, fresh, key_see)
     choose = lambda new, old: jnp.where(done, new, old)
     seen = jax.tree.map(choose, first, outcome.observation)
@@ -198,12 +211,12 @@ def _target(world: World, state: EnvState, action: Float[Array, " J"]) -> Float[
     return robot.nominal_pose + robot.action_scale * action - state.joint_offset
 
 
-def _blown_up(body: Body, c: config.Physics) -> Bool[Array, ""]:
+def _is_unstable(body: Body, c: config.Physics) -> Bool[Array, ""]:
     finite = jnp.isfinite(body.qpos).all() & jnp.isfinite(body.qvel).all()
     return ~(finite & (jnp.abs(body.qvel).max() < c.velocity_limit))
 
 
-def _snapshot(
+def _reward_snapshot(
     world: World,
     state: EnvState,
     body: Body,
@@ -212,7 +225,7 @@ def _snapshot(
     force: Float[Array, "F 3"],
     swings: gait.Swings,
     action: Float[Array, " J"],
-) -> reward.Snapshot:
+) -> rewards.Snapshot:
     """Return what the reward may look at, from the state before the step and the body after it.
 
     The feet's gait is that of after the step.
@@ -220,11 +233,11 @@ def _snapshot(
     c, feet = world.config, world.physics.feet
     period = c.physics.control_period
     foot = links.position[feet]
-    touching = reward.is_touching(force, c.reward)
+    touching = rewards.is_touching(force, c.reward)
     single = touching[0] ^ touching[1]
-    now = observation.motion(body.qpos, body.qvel, action.size)
+    now = observations.motion(body.qpos, body.qvel, action.size)
     across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
-    return reward.Snapshot(
+    return rewards.Snapshot(
         velocity=now.velocity,
         angular_velocity=now.angular_velocity,
         gravity=now.gravity,
@@ -243,19 +256,21 @@ def _snapshot(
         first_contact=swings.touchdown,
         air_time=swings.air_time,
         last_air_time=state.gait.last_air_time,
-        foothold_distance=foothold.distance(state.candidates, soles.centre),
-        unsupported=foothold.unsupported(_ground(world, state), soles, c.foothold),
+        foothold_distance=footholds.distance(state.candidates, soles.centre),
+        unsupported=footholds.unsupported(_ground(world, state), soles, c.foothold),
         since_single=jnp.where(single, 0.0, state.since_single + period),
         control_period=jnp.float32(period),
     )
 
 
-def _lived(world: World, state: EnvState, body: Body, soles: Soles, s: reward.Snapshot) -> EnvState:
+def _next_state(
+    world: World, state: EnvState, body: Body, soles: Soles, s: rewards.Snapshot
+) -> EnvState:
     """Return the state after the step, if the episode goes on."""
     c = world.config
-    touching = reward.is_touching(s.foot_force, c.reward)
-    support = reward.support_height(s.foot_z, s.foot_force, c.reward)
-    ahead = foothold.candidates(
+    touching = rewards.is_touching(s.foot_force, c.reward)
+    support = rewards.support_height(s.foot_z, s.foot_force, c.reward)
+    ahead = footholds.candidates(
         _ground(world, state), soles.centre, soles.heading, state.command[0], c.foothold
     )
     return state.replace(
@@ -266,14 +281,14 @@ def _lived(world: World, state: EnvState, body: Body, soles: Soles, s: reward.Sn
         since_single=s.since_single,
         support_z=jnp.where(touching.any(), support, state.support_z),
         foothold_distance=jnp.minimum(s.foothold_distance, FAR),
-        candidates=foothold.updated(state.candidates, ahead, touching & state.gait.down),
+        candidates=footholds.update_candidates(state.candidates, ahead, touching & state.gait.down),
         step=state.step + 1,
     )
 
 
 def _measures(
     state: EnvState,
-    s: reward.Snapshot,
+    s: rewards.Snapshot,
     terms: dict[str, Float[Array, ""]],
 ) -> Measures:
     return Measures(

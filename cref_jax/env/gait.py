@@ -29,13 +29,13 @@ class Swings(NamedTuple):
     air_time: Float[Array, " F"]  # s, from the last contact before the swing to the first after it
 
 
-def standing() -> Gait:
+def standing_gait() -> Gait:
     """Both feet are down, and no swing has been seen."""
     still = jnp.zeros(2)
     return Gait(jnp.ones(2, bool), jnp.zeros(2, jnp.int32), still, still)
 
 
-def advanced(
+def update_gait(
     before: Gait, touching: Bool[Array, " F"], period: float, debounce: int
 ) -> tuple[Gait, Swings]:
     """Follow the feet through a control step of `period` seconds.

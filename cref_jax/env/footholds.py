@@ -62,7 +62,7 @@ def soles(links: Links, robot: Robot) -> Soles:
     )
 
 
-def none(c: config.Foothold) -> Candidates:
+def no_candidates(c: config.Foothold) -> Candidates:
     """Return the candidates before the first liftoff of an episode: not one is accepted."""
     shape = (2, _count(c))
     return Candidates(
@@ -155,7 +155,7 @@ def _windows(
     )
 
 
-def updated(before: Candidates, now: Candidates, bears: Bool[Array, " F"]) -> Candidates:
+def update_candidates(before: Candidates, now: Candidates, bears: Bool[Array, " F"]) -> Candidates:
     """Return the new candidates of the feet that bear on the ground, and the old of the others.
 
     So a foot that has lifted off has those of its last contact, where they were in the world, until

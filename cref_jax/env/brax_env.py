@@ -22,11 +22,12 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cref_jax import config, env, episode
-from cref_jax.observation import Observation
+from cref_jax import config
+from cref_jax.env import environment, resets
+from cref_jax.env.observations import Observation
+from cref_jax.env.world import make_world
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import Physics, resolve_engine
-from cref_jax.world import make_world
 
 with contextlib.redirect_stdout(io.StringIO()):  # it reports that warp-lang is not installed
     from brax.envs.base import Env, State, Wrapper
@@ -72,11 +73,11 @@ class BraxEnv(Env):
         kind = jax.random.randint(key_kind, (), 0, len(lanes.kinds))
         highest = min(c.curriculum.start_level, lanes.levels - 1)
         level = jax.random.randint(key_level, (), 0, highest + 1)
-        state = episode.reset(self.world, key_reset, kind, level)
+        state = resets.reset(self.world, key_reset, kind, level)
         zero = jnp.zeros(())
         return State(
             pipeline_state=state,
-            obs=_obs(env.observe(self.world, state, key_see)),
+            obs=_obs(environment.observe(self.world, state, key_see)),
             reward=zero,
             done=zero,
             metrics=dict.fromkeys(self._metric_names(), zero),
@@ -88,7 +89,7 @@ class BraxEnv(Env):
 
         `done` says that the episode is over, `info["cut"]` that it was no failure.
         """
-        robot, outcome = env.step(self.world, state.pipeline_state, action)
+        robot, outcome = environment.step(self.world, state.pipeline_state, action)
         cut = outcome.ending.truncated.astype(jnp.float32)
         measures = outcome.measures
         period = self.world.config.physics.control_period

@@ -1,0 +1,1 @@
+"""The environment: observations, commands, rewards, terminations, resets and curriculum."""

@@ -1,0 +1,42 @@
+"""Pushes and new commands, drawn only in the steps in which one is due."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PRNGKeyArray
+
+from cref_jax.env import commands, randomization
+from cref_jax.env.state import Draws, EnvState
+from cref_jax.env.world import World
+
+
+def is_draw_due(world: World, state: EnvState) -> Bool[Array, ""]:
+    """Return whether a push or a new command is due in this step."""
+    due = state.command_left <= 0
+    return due | (state.push_left <= 0) if world.config.randomisation.enabled else due
+
+
+def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRNGKeyArray) -> Draws:
+    """Draw what `pushed` and `commanded` take where it is due."""
+    c = world.config
+    (key_shove, key_after), most = jax.random.split(key_push), c.randomisation.push_velocity
+    key_next, key_left = jax.random.split(key_command)
+    command, is_steered = commands.sample_command(world, key_next, state.kind)
+    return Draws(
+        shove=jax.random.uniform(key_shove, (2,), minval=-most, maxval=most),
+        push_left=randomization.sample_steps(c, key_after, c.randomisation.push_period),
+        command=command,
+        is_steered=is_steered,
+        command_left=randomization.sample_steps(c, key_left, c.command.period),
+    )
+
+
+def apply_push(world: World, state: EnvState, draws: Draws) -> EnvState:
+    """Add a sudden planar velocity to the base when a push is due."""
+    if not world.config.randomisation.enabled:
+        return state
+    due = state.push_left <= 0
+    qvel = state.body.qvel.at[:2].add(jnp.where(due, state.spread.pushes * draws.shove, 0.0))
+    return state.replace(
+        body=state.body._replace(qvel=qvel),
+        push_left=jnp.where(due, draws.push_left, state.push_left - 1),
+    )
