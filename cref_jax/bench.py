@@ -21,14 +21,15 @@ from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import brax_peer, cli, config, learn, peers, rollout, roofline, runs, stages
-from cref_jax.config import Config, limits
-from cref_jax.env.world import World
+from cref_jax import brax_peer, cli, config, peers, roofline, stages
+from cref_jax.config import Config, limits, presets
+from cref_jax.env.world import World, build_world
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.roofline import Rates
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import lanes
+from cref_jax.training import devices, iteration, rollout
 
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
 BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the same"
@@ -153,16 +154,16 @@ def _preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
         ConfigError: the terrain or a setting cannot be used.
     """
     device = "cpu" if jax.default_backend() == "cpu" else "gpu"
-    c = config.override(runs.composed(terrain, None, device), changes or {})
+    c = config.override(presets.build_config(terrain, None, device), changes or {})
     limits.check(c)
     return c
 
 
-def _started(c: Config, engine: EngineName) -> tuple[World, learn.RunState]:
+def _started(c: Config, engine: EngineName) -> tuple[World, iteration.RunState]:
     """Return the world and the first state of a run, shared out among the devices."""
-    mesh = runs.mesh_of(c)
-    world = runs.world_of(c, engine, max(parallel.cores() // mesh.size, 1))
-    return world, jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
+    mesh = devices.mesh_of(c)
+    world = build_world(c, engine, max(parallel.cores() // mesh.size, 1))
+    return world, jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
 
 
 def compare_depth(options: Options) -> list[peers.Speed]:
@@ -249,14 +250,14 @@ def _timed(
     stage: str,
     make: Callable[..., Any],
     world: World,
-    state: rollout.Robots | learn.RunState,
+    state: rollout.Robots | iteration.RunState,
 ) -> Row:
     """Compile a stage and return its best time for one control step.
 
     Every device does it with its own robots, as in training.
     """
-    mesh, parts = runs.mesh_of(world.config), learn.partition(world)
-    part = parts if isinstance(state, learn.RunState) else parts.robots
+    mesh, parts = devices.mesh_of(world.config), iteration.partition(world)
+    part = parts if isinstance(state, iteration.RunState) else parts.robots
     shared = functools.partial(jax.shard_map, mesh=mesh, out_specs=P(), check_vma=False)
     # the world is closed over, so not counted: of all lanes a stage reads a little
     alone = shared(functools.partial(make, world), in_specs=(part,))
@@ -272,10 +273,10 @@ def _timed(
 
 def _iteration(options: Options, stage: str, c: Config) -> Row:
     """Return the time of a whole iteration of `make train` with these settings."""
-    mesh = runs.mesh_of(c)
+    mesh = devices.mesh_of(c)
     world, state = _started(c, resolve_engine("auto"))
     begun = time.perf_counter()
-    program = learn.chunk.lower(world, state, mesh, c.run.chunk).compile()
+    program = iteration.chunk.lower(world, state, mesh, c.run.chunk).compile()
     compiled = time.perf_counter() - begun
     run = {"state": state}  # each call consumes the state that it is given
 

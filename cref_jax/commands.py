@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from rich.table import Table
 
-from cref_jax import evaluation, geometry, ppo, rollout, trials
+from cref_jax import evaluation, geometry, ppo, trials
 from cref_jax.config import Config
 from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
+from cref_jax.training import rollout
 
 SECONDS = 10.0  # of a trial; assumed
 SETTLING = 2.0  # s that a robot has to come to rest or to speed; assumed
@@ -141,8 +142,8 @@ def _obey(
         robots, fallen = carry
         command = jnp.where((k < stop)[:, None], told, 0.0)
         robots = _told(robots, command)
-        memory, policy = rollout.act(nets, train, robots)
-        robots, outcome = rollout.advance(world, robots, memory, policy.mean[0])
+        memory, policy = rollout.policy_step(nets, train, robots)
+        robots, outcome = rollout.env_step(world, robots, memory, policy.mean[0])
         fallen = fallen | outcome.ending.terminated
         body = robots.env.body
         ahead = jax.vmap(geometry.rotate_inverse)(body.qpos[:, 3:7], body.qvel[:, :3])[:, :2]

@@ -21,18 +21,18 @@ from cref_jax import (
     commands,
     evaluation,
     evaluation_page,
-    exported,
     ood_suite,
     ood_verdict,
     paper,
     robustness,
-    runs,
     table,
 )
-from cref_jax.env.world import World
+from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
+from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.system import jax_setup, parallel
+from cref_jax.training import run_dir
 
 Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
@@ -79,7 +79,7 @@ class Subject(NamedTuple):
     """A policy to judge."""
 
     source: Path
-    policy: runs.Policy
+    policy: trained.TrainedPolicy
     world: World  # of its own settings
 
 
@@ -90,7 +90,7 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare([options.engine])
         subjects = [_subject(path, options) for path in _sources(options)]
         source = subjects[0].source
-        out = options.out or (source if exported.is_run(source) else Path())
+        out = options.out or (source if sources.is_run(source) else Path())
         if options.film:
             _film(subjects[0], options, out / f"{options.film}.mp4")
             return
@@ -120,15 +120,15 @@ def _sources(options: Options) -> list[Path]:
     given = [*options.run, *options.policy]
     if len(given) > 1 and options.suite != "table":
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
-    return given or [exported.chosen(None, None)]
+    return given or [sources.resolve_policy(None, None)]
 
 
 def _subject(source: Path, options: Options) -> Subject:
     # trials are shared out among the devices, of which a CPU has one a core
     in_trials = options.suite in ("table", "robust", "cross")
     threads = max(parallel.cores() // jax.device_count(), 1) if in_trials else 0
-    world = runs.world_of(exported.read_config(source), options.engine, threads)
-    return Subject(source, exported.load(source, world), world)
+    world = build_world(sources.read_config(source), options.engine, threads)
+    return Subject(source, sources.load(source, world), world)
 
 
 def _count(options: Options) -> int:
@@ -186,12 +186,12 @@ def _film(subject: Subject, options: Options, out: Path) -> None:
 @contextlib.contextmanager
 def _exported(subject: Subject) -> Iterator[Path]:
     """Yield the policy as an exported one; a run's is written for the time being."""
-    if not exported.is_run(subject.source):
+    if not sources.is_run(subject.source):
         yield subject.source
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "policy"
-        exported.write(subject.policy, subject.world, path)
+        writer.write(subject.policy, subject.world, path)
         yield path
 
 
@@ -233,7 +233,7 @@ def _origin(subjects: list[Subject]) -> dict[str, Any]:
         {
             "name": subject.policy.run.name,
             "source": subject.source.name if subject.source.is_absolute() else str(subject.source),
-            "digest": exported.digest(subject.policy),
+            "digest": reader.digest(subject.policy),
             "iteration": subject.policy.iteration,
             "samples": subject.policy.samples,
         }
@@ -241,8 +241,8 @@ def _origin(subjects: list[Subject]) -> dict[str, Any]:
     ]
     return {
         "policies": policies,
-        "versions": runs.versions(),
-        **runs.machine(),
+        "versions": run_dir.versions(),
+        **run_dir.machine(),
     }
 
 

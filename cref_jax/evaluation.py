@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import ppo, rollout, sideways, trials
+from cref_jax import ppo, sideways, trials
 from cref_jax.config import Config
 from cref_jax.env.state import Ending
 from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import generators, lanes
+from cref_jax.training import rollout
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # of an episode on flat ground; assumed
@@ -181,8 +182,8 @@ def _episodes(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
     ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _Step]]:
         before, alive = carry
-        memory, policy = rollout.act(nets, train, before)
-        robots, outcome = rollout.advance(world, before, memory, policy.mean[0])
+        memory, policy = rollout.policy_step(nets, train, before)
+        robots, outcome = rollout.env_step(world, before, memory, policy.mean[0])
         measures, ending = outcome.measures, outcome.ending
         counted = Ending(*(flag & alive for flag in ending))
         seen = _Step(

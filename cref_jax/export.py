@@ -7,8 +7,11 @@ from pathlib import Path
 
 import tyro
 
-from cref_jax import cli, deploy, exported, learner, runs
+from cref_jax import cli, deploy
+from cref_jax.env.world import build_world
+from cref_jax.policy import learner_file, trained, writer
 from cref_jax.system import jax_setup
+from cref_jax.training import run_dir
 
 
 @dataclass(frozen=True)
@@ -35,11 +38,11 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare()
         if options.learner:
             _write_learner(
-                options.run or runs.newest(), cli.writable(options.learner, ".npz", "--learner")
+                options.run or run_dir.newest(), cli.writable(options.learner, ".npz", "--learner")
             )
             return
         if options.refresh:
-            exported.refresh(options.out)
+            writer.refresh(options.out)
         else:
             _export(options)
         times = deploy.self_test(options.out)
@@ -51,18 +54,18 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _export(options: Options) -> None:
     """Write the run's newest policy."""
-    run = options.run or runs.newest()
-    from_file = learner.is_learner(run)
-    world = runs.world_of((learner if from_file else runs).read_config(run), "mujoco")
+    run = options.run or run_dir.newest()
+    from_file = learner_file.is_learner(run)
+    world = build_world((learner_file if from_file else run_dir).read_config(run), "mujoco")
     print(f"exporting {run} ...", flush=True)
-    policy = learner.read(run, world) if from_file else runs.load_policy(run, world)
-    exported.write(policy, world, options.out)
+    policy = learner_file.read(run, world) if from_file else trained.load_policy(run, world)
+    writer.write(policy, world, options.out)
 
 
 def _write_learner(run: Path, out: Path) -> None:
     """Write what the run has learned."""
-    world = runs.world_of(runs.read_config(run), "mujoco")
-    learner.write(runs.load_policy(run, world), out)
+    world = build_world(run_dir.read_config(run), "mujoco")
+    learner_file.write(trained.load_policy(run, world), out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; python -m cref_jax.train --init {out}")
 
 

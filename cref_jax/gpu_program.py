@@ -25,13 +25,14 @@ from jaxtyping import PyTree
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, depth, hlo, learn, runs
-from cref_jax.config import Config, limits
+from cref_jax import cli, depth, hlo
+from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Backend, Body
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
+from cref_jax.training import iteration
 
 LAUNCH = 3e-6  # s; assumed: the least time of a kernel, its launch included
 BANDWIDTH_SHARE = 0.8  # assumed: what a kernel gets of the card's bandwidth
@@ -113,7 +114,7 @@ def main() -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m cref_jax.gpu_program")
     with cli.one_line_errors(options.debug):
-        c = runs.composed(options.terrain, None, "gpu")
+        c = presets.build_config(options.terrain, None, "gpu")
         if options.num_envs:
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=options.num_envs))
         limits.check(c)
@@ -144,7 +145,7 @@ def mesh_of(card: Card) -> Mesh:
     found = topologies.get_topology_desc(
         card.name, "cuda", target_config=_description(card), topology="1x1x1"
     )
-    return Mesh(np.array(found.devices), (learn.AXIS,), axis_types=(AxisType.Auto,))
+    return Mesh(np.array(found.devices), (iteration.AXIS,), axis_types=(AxisType.Auto,))
 
 
 def _description(card: Card) -> str:
@@ -181,7 +182,7 @@ def _description(card: Card) -> str:
 def traced(c: Config, engine: Backend, mesh: Mesh) -> jax.stages.Traced:
     """Return one iteration of training, traced from shapes on the devices of a mesh."""
     world = world_of_shapes(c, engine, NamedSharding(mesh, P()))
-    return learn.chunk.trace(world, learn.shapes(world, mesh), mesh, 1)
+    return iteration.chunk.trace(world, iteration.shapes(world, mesh), mesh, 1)
 
 
 def world_of_shapes(c: Config, engine: Backend, place: NamedSharding) -> World:

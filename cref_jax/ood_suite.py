@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
-from cref_jax import deploy, evaluation, exported, ood, ood_verdict, robot, sideways, stand_in
+from cref_jax import deploy, evaluation, ood, ood_verdict, robot, sideways, stand_in
 from cref_jax.config import Config
 from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.errors import ConfigError
@@ -25,6 +25,7 @@ from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
 from cref_jax.film import write_video
 from cref_jax.ood import Scene
 from cref_jax.ood_verdict import Condition, Outcome, Verdict
+from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.stand_in import StandIn, Start, Trial
 from cref_jax.system import parallel
@@ -86,7 +87,7 @@ def judge(
             "trials must be at least 1, stress trials and seed at least 0, not "
             f"{trials}, {stress_trials} and {seed}"
         )
-    path, found = policy or exported.bundled(), dict(scenes or ood.scenes())
+    path, found = policy or sources.bundled_policy(), dict(scenes or ood.scenes())
     arguments = (path, found, seed, seconds)
     _Runner(*arguments)  # refuses what is no policy before any process is started
     conditions = (GOOD, *(CONDITIONS if stress_trials else ()))
@@ -121,7 +122,7 @@ def film(
     if out.suffix != ".mp4":
         raise ConfigError(f"a film must end in .mp4: {out}")
     ground = ood.named(name)
-    runner = _Runner(policy or exported.bundled(), {name: ground}, seed, TRIAL_SECONDS)
+    runner = _Runner(policy or sources.bundled_policy(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
     physics = runner.config.physics
     spec = robot_scene.stage("all", physics, -ood.DITCH - robot_scene.BASE)
@@ -150,9 +151,9 @@ class _Runner:
     """Runs trials of one policy; keeps what several of them need."""
 
     def __init__(self, path: Path, scenes: Mapping[str, Scene], seed: int, seconds: float) -> None:
-        if exported.is_run(path):
+        if sources.is_run(path):
             raise ConfigError(f"{path} is no exported policy; make one: python -m cref_jax.export")
-        self.config: Config = evaluation.evaluation_config(exported.read_config(path), seconds)
+        self.config: Config = evaluation.evaluation_config(sources.read_config(path), seconds)
         self._contents = deploy.contents(path)
         self._scenes, self._seed, self._seconds = scenes, seed, seconds
         self._body = functools.cache(self._compiled)

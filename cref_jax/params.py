@@ -8,8 +8,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, config, learn, runs
+from cref_jax import cli, config
 from cref_jax.config import Config
+from cref_jax.env.world import build_world
+from cref_jax.training import iteration
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
 def count(variant: config.Variant) -> dict[str, int]:
     """Return the number of parameters of each part of the actor, and of the critic."""
     c = config.override(Config(), {"network": {"variant": variant}, "run": {"num_envs": 4}})
-    params = jax.eval_shape(learn.initial_state, runs.world_of(c)).train.params
+    params = jax.eval_shape(iteration.initial_state, build_world(c)).train.params
     size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))
     parts = {part: size(tree) for part, tree in params.actor["params"].items()}
     return {**parts, "critic": size(params.critic)}

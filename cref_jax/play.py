@@ -21,27 +21,17 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from rich.progress import track
 
-from cref_jax import (
-    cli,
-    config,
-    evaluation,
-    exported,
-    film,
-    network,
-    panel,
-    ppo,
-    robot,
-    rollout,
-    runs,
-)
+from cref_jax import cli, config, evaluation, film, network, panel, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import footholds
-from cref_jax.env.world import World
+from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.system import jax_setup
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.training import rollout
 
 T = TypeVar("T")
 Agent = Literal["trained", "stand", "random"]
@@ -139,13 +129,13 @@ def play(options: Options) -> None:
     if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
         jax.config.update("jax_platforms", "cpu")
     is_trained = options.agent == "trained"
-    source = exported.chosen(options.run, options.policy) if is_trained else options.run
-    c = exported.read_config(source) if source else Config()
+    source = sources.resolve_policy(options.run, options.policy) if is_trained else options.run
+    c = sources.read_config(source) if source else Config()
     suffix = ".png" if options.stills else ".mp4"
-    folder = source if source and exported.is_run(source) else Path()
+    folder = source if source and sources.is_run(source) else Path()
     out = cli.writable(options.out or folder / f"play{suffix}", suffix)
     world = _world(options, c)
-    train = exported.load(source, world).train if source and is_trained else None
+    train = sources.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
     model = robot_scene.build(robot.moving(c.robot), c.physics, world.lanes.tile(0, 0))
     with robot_scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
@@ -209,11 +199,11 @@ def _advance(
     joints = len(world.physics.robot.joint_names)
     memory, action, mind = robots.memory, jnp.zeros((1, joints)), None
     if train is not None:
-        memory, policy = rollout.act(rollout.networks(c, joints), train, robots)
+        memory, policy = rollout.policy_step(rollout.networks(c, joints), train, robots)
         action, mind = policy.mean[0], _mind(c, robots, policy)
     elif agent == "random":
         action = c.initial_std * jax.random.normal(key, action.shape)
-    after, outcome = rollout.advance(world, robots, memory, action)
+    after, outcome = rollout.env_step(world, robots, memory, action)
     step = Step(
         qpos=robots.env.body.qpos[0],
         airborne=outcome.measures.airborne[0],
@@ -256,7 +246,7 @@ def _world(options: Options, c: Config) -> World:
     c = dataclasses.replace(
         c, command=dataclasses.replace(c.command, lane_vx=(options.command, options.command))
     )
-    return runs.world_of(c, "mujoco").replace(lanes=atlas)
+    return build_world(c, "mujoco").replace(lanes=atlas)
 
 
 def _lane(c: config.Terrain, options: Options) -> Atlas:

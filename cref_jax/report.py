@@ -8,9 +8,10 @@ from typing import Any
 
 import tyro
 
-from cref_jax import cli, deploy, exported, page, run_page
+from cref_jax import cli, deploy, page, run_page
 from cref_jax.errors import ConfigError
 from cref_jax.page import Column, Html, Section, code, join
+from cref_jax.policy import sources
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(options.debug):
         if options.out:
             page.check_name(options.out)
-        source = exported.chosen(options.run, options.policy)
-        if options.policy or (options.run is None and not exported.is_run(source)):
+        source = sources.resolve_policy(options.run, options.policy)
+        if options.policy or (options.run is None and not sources.is_run(source)):
             out, document = options.out or Path("policy.html"), _policy_document(source)
         else:
             out = options.out or source / "report.html"

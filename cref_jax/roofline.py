@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from cref_jax import learn, peers
+from cref_jax import peers
+from cref_jax.training import iteration
 
 SIDE = 1024  # of the square matrices whose product is timed
 COPIED = 2**26  # bytes of the array whose copy is timed; more than a cache holds
@@ -39,8 +40,8 @@ class Work(NamedTuple):
 
 def measure() -> Rates:
     """Time a large product and a large copy on every device at once: cores share their memory."""
-    mesh = learn.mesh_of(jax.device_count())
-    each = lambda f: jax.jit(jax.shard_map(f, mesh=mesh, in_specs=P(), out_specs=P(learn.AXIS)))
+    mesh = iteration.mesh_of(jax.device_count())
+    each = lambda f: jax.jit(jax.shard_map(f, mesh=mesh, in_specs=P(), out_specs=P(iteration.AXIS)))
     square, long = jnp.ones((SIDE, SIDE)), jnp.ones(COPIED // 4)
     timed = lambda f, x: peers.shortest(lambda: jax.block_until_ready(f(x)), REPEATS)
     product, copy = each(lambda x: x @ x), each(lambda x: x + 1.0)

@@ -14,15 +14,16 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, deploy, evaluation, exported, film, runs, stand_in, transfer
+from cref_jax import cli, deploy, evaluation, film, stand_in, transfer
 from cref_jax.config import Config
 from cref_jax.disturbance import Disturbance
-from cref_jax.env.world import World
+from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import TRIAL_SECONDS, Crossing
 from cref_jax.physics.simulation import Physics
+from cref_jax.policy import reader, sources
+from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene
-from cref_jax.runs import Policy
 from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.system import jax_setup, parallel
 
@@ -69,15 +70,15 @@ def main(arguments: list[str] | None = None) -> None:
             raise ConfigError(f"--film must end in .mp4: {options.film}")
         if options.film and options.table:
             raise ConfigError("--film goes with one --kind, not with --table")
-        path = options.policy or exported.bundled()
-        policy = exported.read(path)
-        physics = runs.world_of(policy.config, "mujoco").physics
+        path = options.policy or sources.bundled_policy()
+        policy = reader.read(path)
+        physics = build_world(policy.config, "mujoco").physics
         record = (_table if options.table else _one)(policy, path, physics, options)
         if options.out:
             options.out.write_text(json.dumps(record, indent=2) + "\n")
 
 
-def _one(policy: Policy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
+def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
     """Say what becomes of the trials on lanes of one kind, and return it."""
     world = evaluation.crossing_world(policy.config, physics, options.kind, options.size)
     trials = walked(world, path, options)
@@ -97,7 +98,7 @@ def _one(policy: Policy, path: Path, physics: Physics, options: Options) -> dict
     return record
 
 
-def _table(policy: Policy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
+def _table(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
     """Say what becomes of the trials on flat ground and in each cell, and return it."""
     cells: list[transfer.Cell] = []
     asked = transfer.lanes()
@@ -117,7 +118,7 @@ def _table(policy: Policy, path: Path, physics: Physics, options: Options) -> di
     return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
 
 
-def in_training(policy: Policy, physics: Physics, options: Options) -> Crossing:
+def in_training(policy: TrainedPolicy, physics: Physics, options: Options) -> Crossing:
     """Return what becomes of the same trials in the training simulation."""
     return evaluation.cross(
         policy.config, physics, policy.train, options.kind, options.size, options.trials,

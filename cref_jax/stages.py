@@ -11,9 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cref_jax import depth, learn, ppo, rollout
+from cref_jax import depth, ppo
 from cref_jax.env import environment, footholds
 from cref_jax.env.world import World
+from cref_jax.training import camera_feed, iteration, rollout
 
 STEPS = 24  # control steps of one call, as many as a horizon has
 
@@ -65,7 +66,7 @@ def render_frames(world: World, robots: rollout.Robots) -> Any:
     count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
 
     def render(state: environment.EnvState, _: None) -> tuple[environment.EnvState, None]:
-        images = rollout.exposed(world, state)
+        images = camera_feed.render_frames(world, state)
         moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
         return state.replace(camera_pitch=state.camera_pitch + moved), None
 
@@ -92,7 +93,7 @@ def find_footholds(world: World, robots: rollout.Robots) -> Any:
     return jax.lax.scan(find, robots.env.body, None, length=STEPS)[0]
 
 
-def run_policy(world: World, state: learn.RunState) -> Any:
+def run_policy(world: World, state: iteration.RunState) -> Any:
     """Run the policy alone; it encodes a frame as often as one comes."""
     c = world.config
     nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
@@ -100,13 +101,13 @@ def run_policy(world: World, state: learn.RunState) -> Any:
     def step(robots: rollout.Robots, clock: Any) -> tuple[rollout.Robots, Any]:
         due = depth.is_due(clock, c.camera, c.physics.control_period)
         feed = robots.feed and robots.feed.replace(fresh=due)
-        memory, policy = rollout.act(nets, state.train, robots.replace(feed=feed))
+        memory, policy = rollout.policy_step(nets, state.train, robots.replace(feed=feed))
         return robots.replace(memory=memory), policy.mean.sum()
 
     return jax.lax.scan(step, state.robots, jnp.arange(STEPS))
 
 
-def update(world: World, state: learn.RunState) -> Any:
+def update(world: World, state: iteration.RunState) -> Any:
     """Run one epoch of the update on a rollout of zeros with the right shapes."""
     c = world.config
     c = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, horizon=STEPS))
@@ -114,4 +115,4 @@ def update(world: World, state: learn.RunState) -> Any:
     collect = functools.partial(rollout.collect, dataclasses.replace(world, config=c), nets)
     shapes = jax.eval_shape(collect, state.train, state.robots, jax.random.key(0))[1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets.functions, learn.AXIS)
+    return ppo.update(state.train, zeros, jax.random.key(0), c.ppo, nets.functions, iteration.AXIS)

@@ -4,31 +4,30 @@ import dataclasses
 import datetime
 import json
 import sys
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, errors, evaluation, exported, learn, learner, runs
-from cref_jax.config import Config, limits
-from cref_jax.env.world import World
+from cref_jax import cli, evaluation
+from cref_jax.config import Config, limits, presets
+from cref_jax.env.world import World, build_physics, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
-from cref_jax.progress import Reporter
-from cref_jax.system import interrupts, jax_setup, parallel
+from cref_jax.policy import learner_file, sources, trained, warm_start
+from cref_jax.system import jax_setup, parallel
+from cref_jax.training import devices, iteration, run_dir, trainer
 from cref_jax.training.checkpoint import Checkpoints, lock
+from cref_jax.training.progress import Reporter
+from cref_jax.training.trainer import Programs
 
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
 NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings
-MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
 
 Device = Literal["auto", "cpu", "gpu"]
 
@@ -102,11 +101,11 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     options = _options(arguments)
     options = dataclasses.replace(options, device=select_device(options.device))
     if options.resume:
-        run = options.run_dir or runs.newest()
+        run = options.run_dir or run_dir.newest()
         options = dataclasses.replace(options, run_dir=run)
-        base = runs.read_config(run)
+        base = run_dir.read_config(run)
     else:
-        base = runs.composed(options.terrain, options.experiment, options.device)
+        base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
     command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
     c = _with_short_options(command.settings, command.options)
@@ -142,93 +141,27 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
-    run = options.run_dir or runs.ROOT / _name(options)
-    mesh = runs.mesh_of(c, options.devices)
+    run = options.run_dir or run_dir.ROOT / _name(options)
+    mesh = devices.mesh_of(c, options.devices)
     threads = max(parallel.cores() // mesh.size, 1)
     # what is wrong with the terrain is said before anything is written
     world = jax.device_put(
-        runs.world_of(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
+        build_world(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
     )
     with lock(run):
-        with runs.checkpoints(run, c.run.keep) as steps:
+        with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
-            runs.write_config(run, c)
-            runs.write_origin(run, first)
+            run_dir.write_config(run, c)
+            run_dir.write_origin(run, first)
             samples = c.run.num_envs * c.ppo.horizon
             with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
                 report.say(_headline(run, c, options, first))
-                programs = _Programs(world, mesh, report)
+                programs = Programs(world, mesh, report)
                 if first < c.run.iterations:
                     programs.of(min(c.run.chunk, c.run.iterations - first))
                 state = _first_state(world, mesh, steps, options)
-                state = _loop(world, state, steps, report, programs)
+                state = trainer.run_chunks(world, state, steps, report, programs)
         _summary(run, c, state, options)
-
-
-class _Programs:
-    """The compiled programs of chunks of iterations."""
-
-    def __init__(self, world: World, mesh: Mesh, report: Reporter) -> None:
-        self._world, self.mesh, self._report = world, mesh, report
-        self._shapes = learn.shapes(world, mesh)
-        self._of: dict[int, jax.stages.Compiled] = {}
-
-    def of(self, size: int) -> jax.stages.Compiled:
-        """Return the program of `size` iterations; the first one is announced and weighed.
-
-        Raises:
-            ConfigError: it needs more memory than there is.
-        """
-        if size not in self._of:
-            first = not self._of
-            if first:
-                self._report.say(
-                    "compiling (half a minute on four cores, seconds from the cache) ..."
-                )
-            begun = time.monotonic()
-            lowered = learn.chunk.lower(self._world, self._shapes, self.mesh, size)
-            self._of[size] = lowered.compile()
-            if first:
-                seconds = time.monotonic() - begun
-                robots = self._world.config.run.num_envs
-                needed = runs.check_memory(self._of[size], robots, self.mesh.size)
-                self._report.say(
-                    f"compiled in {seconds:.0f} s; it takes {needed / 2**30:.1f} GiB of memory; "
-                    "Ctrl-C saves and stops"
-                )
-        return self._of[size]
-
-
-def _loop(
-    world: World,
-    state: learn.RunState,
-    steps: Checkpoints,
-    report: Reporter,
-    programs: _Programs,
-) -> learn.RunState:
-    """Train chunk by chunk; save in between, at the end, and when asked to stop."""
-    c = world.config
-    done = int(state.train.iteration)
-    if done >= c.run.iterations:
-        report.say(f"nothing left to do: {done} of {c.run.iterations} iterations are done")
-        return state
-    saved = time.monotonic()
-    with interrupts.StopRequest() as stop:
-        while done < c.run.iterations and not stop.asked:
-            program = programs.of(min(c.run.chunk, c.run.iterations - done))
-            begun = time.monotonic()
-            state, log = program(world, state)
-            log = {name: np.asarray(values) for name, values in log.items()}
-            report.chunk(done, log, time.monotonic() - begun)
-            _check_health(log, c.run.num_envs * c.ppo.horizon)
-            done = int(state.train.iteration)
-            if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
-                _save(steps, state, done, programs.mesh)
-                saved = time.monotonic()
-        _save(steps, state, done, programs.mesh)
-    if stop.asked:
-        report.say(f"stopped and saved at iteration {done}")
-    return state
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
@@ -245,19 +178,21 @@ def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
     return latest or 0
 
 
-def _first_state(world: World, mesh: Mesh, steps: Checkpoints, options: Options) -> learn.RunState:
+def _first_state(
+    world: World, mesh: Mesh, steps: Checkpoints, options: Options
+) -> iteration.RunState:
     """Return the state to begin with: fresh, with what was learned, or of the newest checkpoint."""
-    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
+    state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
     if options.init:
-        policy = exported.load(options.init, world)
+        policy = sources.load(options.init, world)
         if _has_critic(options.init, world.config):
             average = jax.tree.map(jnp.copy, policy.train.average)  # the actor gives its own away
             learned = policy.train.replace(average=average, iteration=state.train.iteration)
             return state.replace(train=learned)
-        return state.replace(train=exported.begun(state.train, policy))
+        return state.replace(train=warm_start.begin_as(state.train, policy))
     if not options.resume:
         return state
-    stored, here = steps.meta(), _sharing(state, mesh)
+    stored, here = steps.meta(), trainer.sharing(state, mesh)
     there = {name: stored.get(name, 1) for name in here}
     if there == here:
         return steps.restore(state)[0]
@@ -266,30 +201,6 @@ def _first_state(world: World, mesh: Mesh, steps: Checkpoints, options: Options)
             print(f"{name} changes from {there[name]} to {count}")
     print("so what was learned is kept, the robots start anew, and the run is no longer the same")
     return steps.restore(state, parts=("train",))[0]
-
-
-def _save(steps: Checkpoints, state: learn.RunState, done: int, mesh: Mesh) -> None:
-    steps.save(done, state, _sharing(state, mesh))
-
-
-def _sharing(state: learn.RunState, mesh: Mesh) -> dict[str, int]:
-    """Return how the robots are shared out; each device has the kinds of lane in turn."""
-    return {"num_envs": state.robots.begins.shape[0], "shares": mesh.size}
-
-
-def _check_health(log: Mapping[str, np.ndarray], samples: int) -> None:
-    """Stop before a broken simulation or update is saved.
-
-    Raises:
-        TrainingError: too many robots blew up, or no gradient was finite.
-    """
-    unstable = float(log["episode/unstable"].max()) / samples
-    if unstable > MAX_UNSTABLE:
-        raise errors.TrainingError(
-            f"the physics blew up in {unstable:.1%} of the samples; the last checkpoint is good"
-        )
-    if float(log["loss/skipped"].min()) == 1.0:
-        raise errors.TrainingError("no gradient was finite; the last checkpoint is good")
 
 
 def _headline(run: Path, c: Config, options: Options, first: int) -> str:
@@ -302,11 +213,11 @@ def _headline(run: Path, c: Config, options: Options, first: int) -> str:
     )
 
 
-def _summary(run: Path, c: Config, state: learn.RunState, options: Options) -> None:
+def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:
     """Say what was learned and what to type next."""
     if options.evaluate:
-        physics = runs.physics_of(c, options.engine)
-        one = jax.device_put(runs.kept(state.train), jax.devices()[0])
+        physics = build_physics(c, options.engine)
+        one = jax.device_put(trained.with_averaged_actor(state.train), jax.devices()[0])
         result = evaluation.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')
@@ -327,7 +238,7 @@ def _with_init(c: Config, options: Options) -> Config:
     """
     if options.resume:
         raise ConfigError("give --init or --resume, not both")
-    theirs, ours = exported.read_config(options.init or Path()).network, c.network
+    theirs, ours = sources.read_config(options.init or Path()).network, c.network
     for name, value in dataclasses.asdict(theirs).items():
         if name not in NOT_OF_THE_ACTOR and value != getattr(ours, name):
             raise ConfigError(
@@ -340,9 +251,9 @@ def _with_init(c: Config, options: Options) -> Config:
 
 def _has_critic(init: Path, c: Config) -> bool:
     """Return whether everything that a training learns is in `init`, and not the actor alone."""
-    theirs = exported.read_config(init)
+    theirs = sources.read_config(init)
     read_out = theirs.ppo.readout_weight > 0.0, c.ppo.readout_weight > 0.0
-    whole = exported.is_run(init) or learner.is_learner(init)
+    whole = sources.is_run(init) or learner_file.is_learner(init)
     return whole and theirs.network == c.network and read_out[0] == read_out[1]
 
 

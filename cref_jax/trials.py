@@ -19,13 +19,14 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import depth, ppo, rollout, sideways
+from cref_jax import depth, ppo, sideways
 from cref_jax.config import Config
 from cref_jax.env import resets, stall
 from cref_jax.env.environment import Outcome
 from cref_jax.env.state import Ending, Spread, even_spread
 from cref_jax.env.world import World
-from cref_jax.rollout import Robots
+from cref_jax.training import rollout
+from cref_jax.training.rollout import Robots
 
 FALLS = ("unstable", "tilted", "low", "hit", "dropped")  # of Ending; the first that is true counts
 FAILURES = (*FALLS, "stalled", "late")  # late: on its feet and moving, but not at the end in time
@@ -236,8 +237,8 @@ def _ends(
 
 def _follow(train: ppo.TrainState, world: World, robots: Robots) -> tuple[Robots, Outcome]:
     nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
-    memory, policy = rollout.act(nets, train, robots)
-    return rollout.advance(world, robots, memory, policy.mean[0])
+    memory, policy = rollout.policy_step(nets, train, robots)
+    return rollout.env_step(world, robots, memory, policy.mean[0])
 
 
 def _started(
@@ -248,7 +249,7 @@ def _started(
     split = jax.vmap(jax.random.split)(keys)
     reset = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, 0))
     state = reset(world, split[:, 0], kind, level, spread)
-    return rollout.placed(world, state, split[:, 1])
+    return rollout.init_robots(world, state, split[:, 1])
 
 
 _begin = jax.jit(_started)

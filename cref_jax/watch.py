@@ -20,16 +20,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from rich.progress import Progress
 
-from cref_jax import config, evaluation, exported, network, ppo, rollout, runs, trials
+from cref_jax import config, evaluation, network, ppo, trials
 from cref_jax.config import Config
 from cref_jax.env.environment import Outcome
-from cref_jax.env.world import World, make_world
+from cref_jax.env.world import World, build_world, make_world
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
+from cref_jax.policy import sources
+from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene
-from cref_jax.runs import Policy
 from cref_jax.terrain import Terrain, cross_section, lanes
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.training import rollout
 
 CHUNK = 50  # steps in one call of the compiled program: 1 s; changes no result
 STAIRS = ("stairs_up", "stairs_down", "ascent", "descent")
@@ -69,16 +71,18 @@ class Watched(NamedTuple):
     seen: Any  # what was kept of each step, arrays [T, ...]; only those of `alive` count
 
 
-def opened(run: Path | None, policy: Path | None, engine: EngineName) -> tuple[Policy, World]:
+def opened(
+    run: Path | None, policy: Path | None, engine: EngineName
+) -> tuple[TrainedPolicy, World]:
     """Return the policy that was asked for, or the newest there is, and the world of its training.
 
     Raises:
         ConfigError: it is no policy, or both are given.
         CheckpointError: the run has no checkpoint that can be read.
     """
-    source = exported.chosen(run, policy)
-    world = runs.world_of(exported.read_config(source), engine)
-    return exported.load(source, world)._replace(run=source), world
+    source = sources.resolve_policy(run, policy)
+    world = build_world(sources.read_config(source), engine)
+    return sources.load(source, world)._replace(run=source), world
 
 
 def medium(c: Config) -> Atlas:
@@ -201,8 +205,8 @@ def _chunk(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
     ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], Watched]:
         robots, alive = carry
-        memory, policy = rollout.act(nets, train, robots)
-        after, outcome = rollout.advance(world, robots, memory, policy.mean[0])
+        memory, policy = rollout.policy_step(nets, train, robots)
+        after, outcome = rollout.env_step(world, robots, memory, policy.mean[0])
         alive &= ~(outcome.ending.terminated | outcome.ending.truncated)
         seen = look(world, Moment(robots, policy, outcome, after))
         return (after, alive), Watched(alive, seen)

@@ -11,7 +11,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import deploy, exported, ood, ood_suite
+from cref_jax import deploy, ood, ood_suite
+from cref_jax.policy import sources
 
 # isort: split
 
@@ -42,7 +43,7 @@ def main() -> None:
     for window in options.windows:
         with tempfile.TemporaryDirectory() as folder:
             path = with_window(
-                options.policy or exported.bundled(), window, Path(folder) / "policy"
+                options.policy or sources.bundled_policy(), window, Path(folder) / "policy"
             )
             found = ood_suite.judge(path, options.trials, 0, options.seed, scenes=scenes)
         counts = [scene.successes for scene in found.scenes]

@@ -41,10 +41,11 @@ import tyro
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, exported, terrain, watch
+from cref_jax import cli, evaluation, terrain, watch
 from cref_jax.env import footholds
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
+from cref_jax.policy import sources
 from cref_jax.robot import kinematics
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section, lanes
@@ -157,7 +158,7 @@ def named(options: Options) -> dict[str, Path]:
         ConfigError: a label is missing or there twice, or --policies are not all.
     """
     if not options.policies:
-        source = exported.chosen(options.run, options.policy)
+        source = sources.resolve_policy(options.run, options.policy)
         return {source.stem: source}
     if options.run or options.policy:
         raise ConfigError("give --policies, or one --policy or --run")

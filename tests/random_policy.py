@@ -8,8 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, exported, leaves, network, ppo, robot, runs, vectors
+from cref_jax import config, network, ppo, robot
 from cref_jax.config import Config
+from cref_jax.policy import reference_vectors, trained
+from cref_jax.policy.manifest import build_manifest
+from cref_jax.training import pytree_digest
 
 ROBOT = robot.load(config.Robot())
 J = len(ROBOT.joint_names)
@@ -21,7 +24,7 @@ SMALL = config.Network(
 
 
 @functools.cache
-def policy(variant: config.Variant, net: config.Network = SMALL) -> runs.Policy:
+def policy(variant: config.Variant, net: config.Network = SMALL) -> trained.TrainedPolicy:
     """Return a policy whose every parameter matters, and which has seen observations."""
     c = dataclasses.replace(Config(), network=dataclasses.replace(net, variant=variant))
     actor, carry = network.Actor(c.network, J), network.initial_carry(c.network, 1)
@@ -44,15 +47,15 @@ def policy(variant: config.Variant, net: config.Network = SMALL) -> runs.Policy:
     mean, std = 0.2 * jax.random.normal(key, (OBS,)), jnp.linspace(0.2, 2.0, OBS)
     obs = train.statistics.obs.replace(mean=mean, std=std)
     train = train.replace(statistics=train.statistics._replace(obs=obs))
-    return runs.Policy(c, train, 7, Path("runs/none"))
+    return trained.TrainedPolicy(c, train, 7, Path("runs/none"))
 
 
-def contents(p: runs.Policy) -> tuple[dict, dict[str, np.ndarray]]:
+def contents(p: trained.TrainedPolicy) -> tuple[dict, dict[str, np.ndarray]]:
     """Return the manifest without digests, and the weights."""
-    return exported.manifest(p, ROBOT), leaves.on_host(p.train.params.actor["params"])
+    return build_manifest(p, ROBOT), pytree_digest.on_host(p.train.params.actor["params"])
 
 
-def recorded(count: int, sees: bool = True, seed: int = 0) -> vectors.Recorded:
+def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.Recorded:
     """Return random inputs that could be true: resets, and frames at no regular rate."""
     rng = np.random.default_rng(seed)
     draw = lambda *shape: rng.standard_normal(shape).astype(np.float32)
@@ -63,7 +66,7 @@ def recorded(count: int, sees: bool = True, seed: int = 0) -> vectors.Recorded:
     fresh = rng.random(count) < 0.4
     image = rng.uniform(-0.5, 0.5, (count, 48, 64)).astype(np.float16)
     which = np.maximum.accumulate(np.where(fresh, np.arange(count), 0))
-    return vectors.Recorded(
+    return reference_vectors.Recorded(
         angular_velocity=draw(count, 3),
         gravity=gravity,
         command=rng.uniform([0, -0.3, -1], [1, 0.3, 1], (count, 3)).astype(np.float32),

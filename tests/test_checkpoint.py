@@ -20,9 +20,8 @@ import numpy as np
 import optax
 import pytest
 
-from cref_jax import leaves
 from cref_jax.errors import CheckpointError, DamagedCheckpoint
-from cref_jax.training import checkpoint
+from cref_jax.training import checkpoint, pytree_digest
 from cref_jax.training.checkpoint import Checkpoints
 
 # A read that fails leaves threads of orbax behind that complain of a closed loop.
@@ -64,7 +63,7 @@ def state(seed: int = 0, num_envs: int = 6, width: int = 16) -> State:
 
 def same(a: State, b: State) -> bool:
     alike = jax.tree.structure(a) == jax.tree.structure(b)
-    return alike and leaves.digest(a) == leaves.digest(b)
+    return alike and pytree_digest.digest(a) == pytree_digest.digest(b)
 
 
 @pytest.fixture
@@ -202,7 +201,7 @@ def test_a_part_that_the_state_lacks_is_named(run):
 def test_a_reader_takes_the_policy_alone_and_needs_only_its_shapes(run):
     with Checkpoints(run) as checkpoints:
         params = checkpoints.restore_part("params", jax.eval_shape(lambda: state().params))
-    assert leaves.digest(params) == leaves.digest(state(3).params)
+    assert pytree_digest.digest(params) == pytree_digest.digest(state(3).params)
 
 
 def test_another_shape_is_named_with_both_sizes(run):
@@ -434,11 +433,11 @@ def test_the_lock_of_another_host_is_left_alone(tmp_path):
 
 def test_equal_digests_mean_equal_bits():
     tree = {"a": np.zeros(2, np.float32), "b": np.array([0.0])}
-    assert leaves.digest(tree) == leaves.digest(dict(reversed(tree.items())))
+    assert pytree_digest.digest(tree) == pytree_digest.digest(dict(reversed(tree.items())))
     others = [
         tree | {"a": np.array([0.0, -0.0], np.float32)},
         tree | {"a": np.zeros(2, np.int32)},
         tree | {"a": np.zeros((2, 1), np.float32)},
         {"a": tree["a"], "c": tree["b"]},
     ]
-    assert leaves.digest(tree) not in {leaves.digest(other) for other in others}
+    assert pytree_digest.digest(tree) not in {pytree_digest.digest(other) for other in others}

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from random_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
-from cref_jax import config, deploy, depth, vectors
+from cref_jax import config, deploy, depth
 from cref_jax.deploy import Status
+from cref_jax.policy import reference_vectors
 
 PERIOD = 0.02
 
@@ -47,7 +48,7 @@ def test_it_says_what_the_network_says_over_1000_steps_with_resets(variant):
     trained = policy(variant, config.Network())
     steps = recorded(1000, sees=variant != "blind")
     ours, worst = runtime(variant, config.Network(), rate_rad=[1e6] * J, beyond_rad=[1e6] * J), {}
-    expected = vectors.reference(
+    expected = reference_vectors.reference(
         trained.config.network, trained.train, ROBOT, trained.config.robot, steps
     )
     expected = {name: np.asarray(x) for name, x in expected.items()}

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from cref_jax import eval, exported, ood_suite, paper, table
+from cref_jax import eval, ood_suite, paper, table
 from cref_jax.eval import Options
+from cref_jax.policy import reader, sources
 
 
 def said(capsys, *arguments):
@@ -34,14 +35,14 @@ def test_what_cannot_be_judged_is_one_line(capsys, arguments, message):
 
 
 def test_a_scene_that_does_not_exist_is_met_with_the_nearest(capsys):
-    bundled = str(exported.bundled())
+    bundled = str(sources.bundled_policy())
     error = said(capsys, "--suite", "ood", "--film", "curb", "--policy", bundled)
     assert "unknown scene 'curb'; did you mean 'curbs'?" in error
 
 
 def test_the_bundled_policy_is_judged_where_there_is_no_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert eval._sources(Options()) == [exported.bundled()]
+    assert eval._sources(Options()) == [sources.bundled_policy()]
 
 
 def test_an_evaluation_of_another_suite_is_kept(tmp_path):
@@ -64,7 +65,7 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
         return ood_suite.ood_verdict.verdict({}, {ood_suite.GOOD: {}})
 
     monkeypatch.setattr(ood_suite, "judge", judge)
-    bundled = exported.bundled()
+    bundled = sources.bundled_policy()
     arguments = ["--suite", "ood", "--policy", str(bundled), "--num-envs", "3", "--seed", "5"]
     eval.main([*arguments, "--out", str(tmp_path)])
     assert asked == [(bundled, 3, 2, 5)]
@@ -77,7 +78,7 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
 def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(table.evaluation, "block", lambda: 2)
     monkeypatch.setattr(table.evaluation, "TRIAL_SECONDS", 1.0)
-    bundled = str(exported.bundled())
+    bundled = str(sources.bundled_policy())
     eval.main(["--policy", bundled, bundled, "--num-envs", "2", "--out", str(tmp_path)])
     record = json.loads((tmp_path / "eval.json").read_text())
     cells = {(row["kind"], row["level"]): row for row in record["cells"]}
@@ -100,11 +101,11 @@ def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
 
 
 def test_a_policy_has_one_digest_as_a_run_and_exported():
-    policy = exported.read(exported.bundled())
-    digest = exported.digest(policy)
-    assert digest == exported.digest(policy._replace(iteration=1, run=Path("elsewhere")))
+    policy = reader.read(sources.bundled_policy())
+    digest = reader.digest(policy)
+    assert digest == reader.digest(policy._replace(iteration=1, run=Path("elsewhere")))
     seen = policy.train.statistics.obs
     other = policy.train.replace(
         statistics=policy.train.statistics._replace(obs=seen.replace(mean=seen.mean + 1e-3))
     )
-    assert digest != exported.digest(policy._replace(train=other))
+    assert digest != reader.digest(policy._replace(train=other))

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from random_policy import ROBOT, SMALL, J, policy, recorded
 
-from cref_jax import config, deploy, exported, robot, vectors
+from cref_jax import config, deploy, robot
 from cref_jax.errors import ConfigError
+from cref_jax.policy import reader, reference_vectors, sources, writer
+from cref_jax.policy.manifest import build_manifest
 from cref_jax.robot import x2_ultra
 
 
@@ -25,7 +27,7 @@ def trained(world):
 
 @pytest.fixture
 def directory(small_world, tmp_path):
-    exported.write(trained(small_world), small_world, tmp_path / "policy")
+    writer.write(trained(small_world), small_world, tmp_path / "policy")
     return tmp_path / "policy"
 
 
@@ -54,10 +56,10 @@ def test_a_runtime_that_says_something_else_fails_its_test(directory, monkeypatc
 
 @pytest.mark.slow
 def test_the_vectors_hold_a_reset_a_frame_with_holes_and_the_true_rate(small_world):
-    found = vectors.test_vectors(small_world, trained(small_world).train)
-    assert found["reset"].sum() == 2 and found["reset"][vectors.STEPS // 2]
+    found = reference_vectors.test_vectors(small_world, trained(small_world).train)
+    assert found["reset"].sum() == 2 and found["reset"][reference_vectors.STEPS // 2]
     assert set(np.diff(found["frame_step"][:10])) == {2, 3}
-    holed = found["frames"][vectors.HOLED]
+    holed = found["frames"][reference_vectors.HOLED]
     assert np.isnan(holed).any() and (holed == 0.0).any()
     assert np.abs(found["expect/attention"]).max() > 0.0
     np.testing.assert_allclose(found["now"][found["frame_step"]] - found["stamps"], 0.02)
@@ -65,23 +67,23 @@ def test_the_vectors_hold_a_reset_a_frame_with_holes_and_the_true_rate(small_wor
 
 @pytest.mark.slow
 def test_a_policy_comes_back_as_it_went(directory, small_world):
-    was, found = trained(small_world), exported.read(directory, small_world)
+    was, found = trained(small_world), reader.read(directory, small_world)
     assert found.config == was.config and found.iteration == was.iteration
     steps = recorded(20)
-    say = lambda train: vectors.reference(SMALL, train, ROBOT, was.config.robot, steps)
+    say = lambda train: reference_vectors.reference(SMALL, train, ROBOT, was.config.robot, steps)
     np.testing.assert_array_equal(say(found.train)["action"], say(was.train)["action"])
 
 
 def test_the_manifest_has_the_command_and_no_one_s_folders(tmp_path):
     words = ["/home/someone/train.py", "--terrain", "gap", "--run-dir", "/home/someone/runs/gap"]
     (tmp_path / "origin.jsonl").write_text(json.dumps({"command": words}) + "\n")
-    manifest = exported.manifest(policy("full")._replace(run=tmp_path), ROBOT)
+    manifest = build_manifest(policy("full")._replace(run=tmp_path), ROBOT)
     command = manifest["provenance"]["trained_by"]["command"]
     assert command == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
 
 
 def test_the_manifest_says_what_the_engineer_needs():
-    manifest = exported.manifest(policy("full"), ROBOT)
+    manifest = build_manifest(policy("full"), ROBOT)
     assert [joint["name"] for joint in manifest["joints"]] == list(ROBOT.joint_names)
     whole = robot.load(config.Robot(actuated="all"))
     held = {joint["name"] for joint in manifest["held_joints"]}
@@ -94,7 +96,7 @@ def test_the_manifest_says_what_the_engineer_needs():
 
 
 def test_numbers_survive_the_text_to_the_last_bit():
-    manifest = json.loads(json.dumps(exported.manifest(policy("full"), ROBOT)))
+    manifest = json.loads(json.dumps(build_manifest(policy("full"), ROBOT)))
     mean = np.asarray(policy("full").train.statistics.obs.mean)
     np.testing.assert_array_equal(np.array(manifest["observation"]["mean"], np.float32), mean)
     kp = [joint["kp"] for joint in manifest["joints"]]
@@ -103,34 +105,34 @@ def test_numbers_survive_the_text_to_the_last_bit():
 
 def test_a_run_and_a_policy_exclude_each_other(tmp_path):
     with pytest.raises(ConfigError, match="not both"):
-        exported.chosen(tmp_path, tmp_path)
-    assert exported.chosen(None, tmp_path) == tmp_path
+        sources.resolve_policy(tmp_path, tmp_path)
+    assert sources.resolve_policy(None, tmp_path) == tmp_path
 
 
 def test_without_a_run_the_bundled_policy_is_taken(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert exported.chosen(None, None) == exported.bundled()
-    assert not exported.is_run(exported.bundled())
+    assert sources.resolve_policy(None, None) == sources.bundled_policy()
+    assert not sources.is_run(sources.bundled_policy())
 
 
 def test_what_is_no_policy_is_one_line(tmp_path):
     (tmp_path / "manifest.json").write_text("{}")
     with pytest.raises(ConfigError, match="has no 'format'"):
-        exported.read_config(tmp_path)
+        sources.read_config(tmp_path)
 
 
 def test_the_bundled_policy_is_whole_and_small_enough():
-    deploy.self_test(exported.bundled(), rounds=1)
-    files = list(exported.bundled().iterdir())
+    deploy.self_test(sources.bundled_policy(), rounds=1)
+    files = list(sources.bundled_policy().iterdir())
     assert sum(file.stat().st_size for file in files) < 10e6
 
 
 @pytest.mark.parametrize("name", ["mixed", "robust"])
 def test_the_bundled_runtime_is_this_versions(name):
-    theirs = exported.bundled().with_name(name) / "cref_runtime.py"
+    theirs = sources.bundled_policy().with_name(name) / "cref_runtime.py"
     assert theirs.read_bytes() == Path(deploy.__file__).read_bytes()  # export --refresh mends it
 
 
 @pytest.mark.parametrize("name", ["mixed", "robust"])  # one with a ray per pixel, one with windows
 def test_a_bundled_policy_says_what_it_said_in_training(name):
-    deploy.self_test(exported.bundled().with_name(name))
+    deploy.self_test(sources.bundled_policy().with_name(name))

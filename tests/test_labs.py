@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Int
 from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
-from cref_jax import cli, config, exported, gaze, runs, watch
+from cref_jax import cli, config, gaze, watch
 from cref_jax.config import Config
-from cref_jax.env.world import World
+from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.policy import writer
 from cref_jax.terrain import atlas, cross_section, lanes
 from cref_jax.terrain.cross_section import DOWN, UP
 from cref_jax.watch import Moment, Watched
@@ -354,7 +355,7 @@ def tiny(tmp_path_factory):
     """Return an exported policy with random parameters."""
     path = tmp_path_factory.mktemp("labs") / "tiny"
     p = policy("full", SMALL)
-    exported.write(p, runs.world_of(p.config, "mujoco"), path)
+    writer.write(p, build_world(p.config, "mujoco"), path)
     return path
 
 
@@ -400,7 +401,7 @@ def counted(world: World, moment: Moment) -> Count:
 @pytest.mark.slow
 def test_nothing_counts_from_a_robots_end_on():
     blind = policy("blind")
-    world = runs.world_of(blind.config, "mujoco")
+    world = build_world(blind.config, "mujoco")
     world = watch.placed(blind.config, world, lanes.single(Config().terrain, "flat", 0.0), 0.6)
     robots = watch.begin(world, 0, 4)
     watched = watch.watch(world, blind.train, robots, 200, counted)

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from random_policy import SMALL
 
-from cref_jax import config, exported, learn, learner
+from cref_jax import config
 from cref_jax.errors import ConfigError
-from cref_jax.runs import Policy
+from cref_jax.policy import learner_file, sources
+from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import iteration
 
 
 @pytest.fixture
@@ -18,40 +20,40 @@ def small(world):
     return world.replace(config=dataclasses.replace(world.config, network=SMALL))
 
 
-def learned(world, path) -> Policy:
+def learned(world, path) -> TrainedPolicy:
     """Return a policy no two of whose arrays are alike."""
-    like = jax.eval_shape(lambda w: learn.initial_state(w).train, world)
+    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
     fill = lambda x, k: jnp.full(x.shape, k + 1, x.dtype)
     leaves, tree = jax.tree.flatten(like)
     train = jax.tree.unflatten(tree, [fill(x, k) for k, x in enumerate(leaves)])
-    return Policy(world.config, train, 7, path)
+    return TrainedPolicy(world.config, train, 7, path)
 
 
 def test_everything_comes_back(small, tmp_path):
     path = tmp_path / "new" / "learned.npz"
     policy = learned(small, path)
-    learner.write(policy, path)
-    back = exported.load(path, small)
+    learner_file.write(policy, path)
+    back = sources.load(path, small)
     jax.tree.map(np.testing.assert_array_equal, back.train, policy.train)
     assert (back.config, back.iteration) == (policy.config, 7)
-    assert exported.read_config(path) == small.config and not exported.is_run(path)
+    assert sources.read_config(path) == small.config and not sources.is_run(path)
 
 
 def test_another_network_is_refused(small, tmp_path):
     path = tmp_path / "learned.npz"
-    learner.write(learned(small, path), path)
+    learner_file.write(learned(small, path), path)
     wider = config.override(small.config, {"network": {"gru": 9}})
     with pytest.raises(ConfigError, match="does not fit these settings"):
-        learner.read(path, small.replace(config=wider))
+        learner_file.read(path, small.replace(config=wider))
 
 
 def test_a_file_that_is_something_else_is_refused(small, tmp_path):
     path = tmp_path / "x.npz"
     with pytest.raises(ConfigError, match="cannot read"):
-        learner.read(path, small)
+        learner_file.read(path, small)
     path.write_bytes(b"no archive")
     with pytest.raises(ConfigError, match="cannot read"):
-        learner.read_config(path)
+        learner_file.read_config(path)
     np.savez(path, kernel=np.zeros(3))
     with pytest.raises(ConfigError, match="not what export --learner writes"):
-        learner.read_config(path)
+        learner_file.read_config(path)

@@ -13,7 +13,9 @@ from typing import Any
 import jax
 import pytest
 
-from cref_jax import gpu_program, learn, runs
+from cref_jax import gpu_program
+from cref_jax.config import presets
+from cref_jax.training import iteration
 
 pytestmark = pytest.mark.slow
 
@@ -26,9 +28,9 @@ MOST = {"while": 18, "case": 6, "sort": 7, "triangular_solve": 4, "operations": 
 
 @functools.cache
 def traced() -> jax.stages.Traced:
-    c = runs.composed("mixed", None, "gpu")
+    c = presets.build_config("mixed", None, "gpu")
     c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=ROBOTS))
-    return gpu_program.traced(c, "mjx", learn.mesh_of())
+    return gpu_program.traced(c, "mjx", iteration.mesh_of())
 
 
 @functools.cache

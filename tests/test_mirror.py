@@ -8,8 +8,9 @@ import pytest
 import sample
 from sample import ROBOTS, C, on, one
 
-from cref_jax import config, learn, mirror, network, rollout
+from cref_jax import config, network
 from cref_jax.env import environment
+from cref_jax.training import iteration, mirror, rollout
 
 MODEL_NAMES = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 SIGNS = (1, -1, -1, 1, 1, -1)
@@ -108,7 +109,7 @@ def taught():
         },
     )
     world = sample.world().replace(config=c)
-    return world, jax.jit(learn.initial_state)(world)
+    return world, jax.jit(iteration.initial_state)(world)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
     world, state = symmetric
     of = mirror.of(world.physics.model, world.config.network)
     nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
-    act = jax.jit(lambda nets, r: rollout.act(nets, state.train, r), static_argnums=0)
+    act = jax.jit(lambda nets, r: rollout.policy_step(nets, state.train, r), static_argnums=0)
     keys = iter(jax.random.split(jax.random.key(5), 9))
     noise = lambda x: jax.random.uniform(next(keys), x.shape, x.dtype)
     robots = state.robots
@@ -142,7 +143,7 @@ def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
 
 def test_training_remembers_what_the_twin_has_seen(symmetric):
     world, state = symmetric
-    after, log = learn.chunk(world, state, learn.mesh_of(), 2)
+    after, log = iteration.chunk(world, state, iteration.mesh_of(), 2)
     assert (log["loss/asymmetry"] > 0.0).all()
     twin, own = after.robots.memory.twin, after.robots.memory
     assert not np.allclose(twin.carry.gru, own.carry.gru)

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cref_jax import deploy, exported, ood, ood_suite, ood_verdict
+from cref_jax import deploy, ood, ood_suite, ood_verdict
 from cref_jax.deploy import Status
 from cref_jax.disturbance import Disturbance
 from cref_jax.errors import ConfigError
 from cref_jax.ood_suite import CONDITIONS, GOOD
 from cref_jax.ood_verdict import Condition, Outcome
+from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.system import parallel
 
@@ -24,7 +25,7 @@ def outcome(ending, seconds=9.0, status=Status.OK):
 
 
 def arguments(seed=0):
-    return exported.bundled(), FEW, seed, 0.4
+    return sources.bundled_policy(), FEW, seed, 0.4
 
 
 def runner():

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cref_jax import learn, play, robot, runs
+from cref_jax import play, robot
 from cref_jax.config import Config
+from cref_jax.env.world import build_world
 from cref_jax.errors import ConfigError
 from cref_jax.play import Options, Recording
 from cref_jax.rendering import robot_scene
+from cref_jax.training import iteration, run_dir
 
 
 @pytest.fixture
@@ -129,11 +131,11 @@ def test_a_trained_policy_walks_on_another_terrain(opengl, tmp_path):
     run = tmp_path / "runs" / "mine"
     small = {"lstm": 8, "gru": 8, "token": 8, "actor": [8], "critic": [8]}
     c = play.config.override(Config(), {"run": {"num_envs": 4}, "network": small})
-    world = runs.world_of(c, "mujoco")
-    state = jax.jit(learn.initial_state)(world)
+    world = build_world(c, "mujoco")
+    state = jax.jit(iteration.initial_state)(world)
     run.mkdir(parents=True)
-    runs.write_config(run, c)
-    with runs.checkpoints(run) as steps:
+    run_dir.write_config(run, c)
+    with run_dir.checkpoints(run) as steps:
         steps.save(0, state, {"num_envs": 4})
     play.main(["--run", str(run), "--terrain", "stairs", "--level", "easy", "--seconds", "0.2"])
     assert (run / "play.mp4").stat().st_size > 1000

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from random_policy import ROBOT, J, contents, policy
 
-from cref_jax import deploy, exported
+from cref_jax import deploy
 from cref_jax.deploy import PolicyFormatError
+from cref_jax.policy import writer
 
 MUTATIONS = 10_000
 
@@ -21,7 +22,7 @@ MUTATIONS = 10_000
 def files() -> dict[str, bytes]:
     """Return the files of a small policy that is whole."""
     manifest, arrays = contents(policy("full"))
-    return signed(manifest, {"weights.npz": exported._npz(arrays)})
+    return signed(manifest, {"weights.npz": writer._npz(arrays)})
 
 
 def signed(manifest, files) -> dict[str, bytes]:
@@ -60,7 +61,7 @@ def npz(arrays, **settings) -> bytes:
 def test_what_was_written_is_read_from_the_directory_and_from_the_archive(tmp_path, files):
     original = contents(policy("full"))
     put(tmp_path, files)
-    (tmp_path / "policy.zip").write_bytes(exported._stored(files))
+    (tmp_path / "policy.zip").write_bytes(writer._stored(files))
     for path in (tmp_path, tmp_path / "policy.zip"):
         manifest, arrays = deploy.contents(path)
         assert {k: manifest[k] for k in original[0]} == json.loads(json.dumps(original[0]))
@@ -122,7 +123,7 @@ def npy(array) -> bytes:
 
 
 def archive(files) -> bytes:
-    return exported._stored(files)
+    return writer._stored(files)
 
 
 def test_damaged_weights_are_refused_even_where_the_digest_is_right(tmp_path, files):

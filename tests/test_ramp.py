@@ -5,22 +5,27 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from cref_jax import config, ramp
+from cref_jax import config
+from cref_jax.training import randomization_ramp
 
 C = dataclasses.replace(config.Randomisation(), ramp=True, ramp_falls=(2.0, 4.0), ramp_step=0.1)
 
 
-def after(falls: float, iterations: int, start: ramp.Ramp | None = None) -> ramp.Ramp:
-    state = start or ramp.begun(C)
+def after(
+    falls: float, iterations: int, start: randomization_ramp.Ramp | None = None
+) -> randomization_ramp.Ramp:
+    state = start or randomization_ramp.initial_ramp(C)
     for _ in range(iterations):
-        state = ramp.advanced(state, jnp.float32(falls), C)
+        state = randomization_ramp.update_ramp(state, jnp.float32(falls), C)
     return state
 
 
 def test_it_begins_with_nothing_and_without_a_ramp_with_everything():
-    assert float(ramp.begun(C).share) == 0.0
+    assert float(randomization_ramp.initial_ramp(C).share) == 0.0
     off = config.Randomisation()
-    state = ramp.advanced(ramp.begun(off), jnp.float32(99.0), off)
+    state = randomization_ramp.update_ramp(
+        randomization_ramp.initial_ramp(off), jnp.float32(99.0), off
+    )
     assert float(state.share) == 1.0
 
 

@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from PIL import Image
 from reading import leaves, read
 
-from cref_jax import config, curves, exported, learning_charts, report, run_page, runs
+from cref_jax import config, curves, learning_charts, report, run_page
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
+from cref_jax.policy import sources
+from cref_jax.training import run_dir
 
 ORIGIN = {
     "time": "2026-01-02T03:04:05+00:00",
@@ -58,7 +60,7 @@ def run(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     changes = {"run": {"iterations": 100, "num_envs": 250}, "terrain": {"name": "gap"}}
-    runs.write_config(folder, config.override(Config(), changes))
+    run_dir.write_config(folder, config.override(Config(), changes))
     (folder / "origin.jsonl").write_text(json.dumps(ORIGIN) + "\n")
     write_log(folder / "log.jsonl", [row(i) for i in range(1, 41)])
     return folder
@@ -195,14 +197,14 @@ def test_without_a_run_the_bundled_policy_is_shown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     report.main([])
     seen = read(tmp_path / "policy.html")
-    manifest = json.loads((exported.bundled() / "manifest.json").read_text())
+    manifest = json.loads((sources.bundled_policy() / "manifest.json").read_text())
     assert manifest["digest"] in seen.text and leaves(seen) == []
     for joint in (*manifest["joints"], *manifest["held_joints"]):
         assert next(r for r in seen.rows if r[0] == joint["name"])[4] == f"{joint['kp']:.4g}"
 
 
 def test_a_start_says_how_many_iterations_are_done(tmp_path):
-    runs.write_origin(tmp_path, 7)
+    run_dir.write_origin(tmp_path, 7)
     assert json.loads((tmp_path / "origin.jsonl").read_text())["iteration"] == 7
 
 

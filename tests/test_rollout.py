@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import sample
 
-from cref_jax import config, depth, learn, ppo, rollout
+from cref_jax import config, depth, ppo
 from cref_jax.config import Config
 from cref_jax.env import environment
+from cref_jax.training import iteration, rollout
 
 E, T = 4, 12
 
@@ -41,7 +42,7 @@ def two_horizons(variant: str):
     """Return the world, the learner, and two successive horizons with the robots before each."""
     world = sample.world().replace(config=small(variant))
     c = world.config
-    state = jax.jit(learn.initial_state)(world)
+    state = jax.jit(iteration.initial_state)(world)
     nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
     collect = jax.jit(lambda w, r, k: rollout.collect(w, nets, state.train, r, k))
     middle, first, _ = collect(world, state.robots, jax.random.key(1))
@@ -84,7 +85,7 @@ def test_a_frame_shows_the_robot_one_control_step_before(seeing):
     world, _, _, (before, _, _), _ = seeing
     state = before
     period = world.config.physics.control_period
-    advance = jax.jit(rollout.advance)
+    advance = jax.jit(rollout.env_step)
     expose = jax.jit(jax.vmap(environment.depth_image, in_axes=(None, 0)))
     came = 0
     for _ in range(8):
@@ -131,7 +132,7 @@ def test_sixteen_bits_are_enough_for_a_frame():
 
 def test_changing_one_robot_changes_no_other(seeing):
     _, nets, train, (before, _, _), _ = seeing
-    act = jax.jit(lambda r: rollout.act(nets, train, r)[1].mean)
+    act = jax.jit(lambda r: rollout.policy_step(nets, train, r)[1].mean)
     moved = before.replace(
         observation=jax.tree.map(lambda x: x.at[0].add(1.0), before.observation),
         feed=dataclasses.replace(

@@ -6,8 +6,9 @@ from unittest.mock import Mock
 import jax
 import pytest
 
-from cref_jax import runs
+from cref_jax.config import presets
 from cref_jax.errors import ConfigError
+from cref_jax.training import devices
 
 GIB = 2**30
 
@@ -25,24 +26,25 @@ def program(arguments, temporary, output=0, alias=0):
 
 
 def test_memory_is_what_goes_in_what_comes_out_and_what_lies_between(monkeypatch):
-    monkeypatch.setattr(runs, "_main_memory", lambda: 64 * GIB)
+    monkeypatch.setattr(devices, "_main_memory", lambda: 64 * GIB)
     # the output takes the place of the state that went in
-    assert runs.check_memory(program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB), 4096) == 8 * GIB
+    assert devices.check_memory(program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB), 4096) == 8 * GIB
 
 
 def test_too_many_robots_are_refused_with_a_number_that_fits(monkeypatch):
-    monkeypatch.setattr(runs, "_main_memory", lambda: 6 * GIB)
+    monkeypatch.setattr(devices, "_main_memory", lambda: 6 * GIB)
     # 4096 x 6 / 8 = 3072 would fit; the power of two below it is 2048
     with pytest.raises(ConfigError, match=r"need 8.0 GiB and the device has 6.0; .* 2048"):
-        runs.check_memory(program(3 * GIB, 5 * GIB), 4096)
+        devices.check_memory(program(3 * GIB, 5 * GIB), 4096)
 
 
 def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
-    flat, gap = runs.composed("flat", None, "cpu"), runs.composed("gap", None, "cpu")
+    flat, gap = presets.build_config("flat", None, "cpu"), presets.build_config("gap", None, "cpu")
     assert flat.network.variant == "blind" and gap.network.variant == "full"
     assert flat.run.num_envs == gap.run.num_envs == 256
     assert (
-        not flat.randomisation.enabled and runs.composed("gap", None, "gpu").randomisation.enabled
+        not flat.randomisation.enabled
+        and presets.build_config("gap", None, "gpu").randomisation.enabled
     )
 
 
@@ -59,12 +61,12 @@ def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
     ],
 )
 def test_an_experiment_changes_what_its_name_says(experiment, table, setting, value):
-    c = runs.composed("mixed", experiment, "gpu")
+    c = presets.build_config("mixed", experiment, "gpu")
     assert getattr(getattr(c, table), setting) == value
 
 
 def test_the_paper_is_the_same_on_every_device():
-    cpu, gpu = (runs.composed("mixed", "paper", device) for device in ("cpu", "gpu"))
+    cpu, gpu = (presets.build_config("mixed", "paper", device) for device in ("cpu", "gpu"))
     assert cpu == gpu
     assert cpu.reward.event_time == cpu.physics.control_period  # a touchdown is one step's reward
     additions = cpu.reward.weights.air_time_variance, cpu.reward.weights.foot_up_when_standing
@@ -72,7 +74,7 @@ def test_the_paper_is_the_same_on_every_device():
 
 
 def test_the_reward_experiments_differ_in_the_foothold_terms_alone():
-    weights = lambda name: runs.composed("stairs", name, "gpu").reward.weights
+    weights = lambda name: presets.build_config("stairs", name, "gpu").reward.weights
     none, quality = weights("no_foothold_reward"), weights("foot_contact_quality")
     assert (none.foothold_placement, none.foot_contact_quality) == (0.0, 0.0)
     assert quality.foothold_placement == 0.0

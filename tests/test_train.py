@@ -12,12 +12,15 @@ import jax
 import numpy as np
 import pytest
 
-from cref_jax import config, export, exported, learn, runs, train
+from cref_jax import config, export, train
+from cref_jax.env.world import build_world
+from cref_jax.policy import reader, sources, trained, writer
+from cref_jax.training import devices, iteration, run_dir
 from cref_jax.training.checkpoint import Checkpoints
 
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
 TINY += ["--no-tensorboard", "--no-evaluate"]
-BUNDLED = str(exported.bundled())
+BUNDLED = str(sources.bundled_policy())
 
 
 def run(folder: Path, *more: str) -> None:
@@ -34,8 +37,8 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def state_of(folder: Path) -> list[np.ndarray]:
     """Return every number of the newest checkpoint."""
-    c = runs.read_config(folder)
-    like = jax.jit(learn.initial_state)(runs.world_of(c))
+    c = run_dir.read_config(folder)
+    like = jax.jit(iteration.initial_state)(build_world(c))
     with Checkpoints(folder / "checkpoints") as steps:
         state, _ = steps.restore(like)
     plain = lambda x: (
@@ -121,12 +124,12 @@ def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, vari
 
 @pytest.mark.slow
 def test_a_run_begins_as_a_policy_whose_critic_is_gone(first: Path, tmp_path: Path):
-    world = runs.world_of(runs.read_config(first))
-    exported.write(runs.load_policy(first, world), world, tmp_path / "policy")
-    policy = exported.read(tmp_path / "policy")
+    world = build_world(run_dir.read_config(first))
+    writer.write(trained.load_policy(first, world), world, tmp_path / "policy")
+    policy = reader.read(tmp_path / "policy")
     run(tmp_path / "second", "--init", str(tmp_path / "policy"), "--iterations", "1")
-    assert runs.read_config(tmp_path / "second").ppo.critic_first == 200
-    begun = runs.load_policy(tmp_path / "second", world).train
+    assert run_dir.read_config(tmp_path / "second").ppo.critic_first == 200
+    begun = trained.load_policy(tmp_path / "second", world).train
     for a, b in zip(*(jax.tree.leaves(t.params.actor) for t in (policy.train, begun)), strict=True):
         np.testing.assert_array_equal(a, b)  # the critic alone has learned
     # 2 x 8 x 24 samples were seen before, and as many in half again
@@ -143,11 +146,11 @@ def test_a_run_begins_as_another_run_with_all_that_it_learned(first, tmp_path, a
     if as_file:
         export.main(["--run", str(first), "--learner", str(source)])
     run(tmp_path / "second", "--init", str(source), "--iterations", "1")
-    assert runs.read_config(tmp_path / "second").ppo.critic_first == 0
+    assert run_dir.read_config(tmp_path / "second").ppo.critic_first == 0
     log = [json.loads(line) for line in (tmp_path / "second" / "log.jsonl").open()]
     assert log[0]["iteration"] == 1
-    world = runs.world_of(runs.read_config(first))
-    before, after = (runs.load_policy(n, world).train for n in (first, tmp_path / "second"))
+    world = build_world(run_dir.read_config(first))
+    before, after = (trained.load_policy(n, world).train for n in (first, tmp_path / "second"))
     # 2 iterations of 8 x 24 samples, then one more
     assert int(before.statistics.critic_obs.count) == 384
     assert int(after.statistics.critic_obs.count) == 576
@@ -172,14 +175,14 @@ def test_devices_share_the_robots_and_hold_the_same_parameters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     run(tmp_path / "two", "--devices", "2")
-    c = runs.read_config(tmp_path / "two")
-    mesh = runs.mesh_of(c)
-    world = runs.world_of(c)
-    state = jax.jit(learn.initial_state, static_argnames="mesh")(world, mesh)
+    c = run_dir.read_config(tmp_path / "two")
+    mesh = devices.mesh_of(c)
+    world = build_world(c)
+    state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
     assert [s.data.shape[0] for s in state.robots.begins.addressable_shards] == [4, 4]
     first, second = (s.data for s in state.robots.env.body.qpos.addressable_shards)
     assert not np.array_equal(first, second), "each device has its own random numbers"
-    state, log = learn.chunk(world, state, mesh, 2)
+    state, log = iteration.chunk(world, state, mesh, 2)
     for leaf in jax.tree.leaves(state.train):
         shards = [np.asarray(s.data) for s in leaf.addressable_shards]
         np.testing.assert_array_equal(*shards)

@@ -9,10 +9,11 @@ import pytest
 from random_policy import SMALL
 from sample import assert_equal, one
 
-from cref_jax import config, evaluation, rollout, table, trials
+from cref_jax import config, evaluation, table, trials
 from cref_jax.config import Config
 from cref_jax.env.state import Ending
 from cref_jax.physics.simulation import Physics
+from cref_jax.training import rollout
 from cref_jax.trials import ENDINGS, Trace
 
 C = config.override(
@@ -67,7 +68,7 @@ def step(which, world, robots):
     env = robots.env
     body = jax.lax.switch(which, (along, still, lying, bursting), env, env.body)
     moved = robots.replace(env=env.replace(body=body))
-    return rollout.advance(world, moved, robots.memory, jnp.zeros_like(env.action))
+    return rollout.env_step(world, moved, robots.memory, jnp.zeros_like(env.action))
 
 
 # which of them it is, is a number: so they share one compiled program

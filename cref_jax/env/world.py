@@ -9,8 +9,8 @@ from jaxtyping import PRNGKeyArray
 
 from cref_jax import terrain
 from cref_jax.config import Config
-from cref_jax.physics.records import Body
-from cref_jax.physics.simulation import Physics
+from cref_jax.physics.records import Body, EngineName
+from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
 
@@ -56,3 +56,13 @@ def _settled(c: Config, physics: Physics) -> Body:
     keys = jax.random.split(jax.random.key(c.terrain.seed), c.episode.bank_size)
     # waited for: a program that calls the host must not outlive the interpreter
     return jax.block_until_ready(jax.jit(jax.vmap(settle))(keys))
+
+
+def build_world(c: Config, engine: EngineName = "auto", threads: int = 0) -> World:
+    """Return the world that a configuration describes; `threads` is as in Physics."""
+    return make_world(c, build_physics(c, engine, threads))
+
+
+def build_physics(c: Config, engine: EngineName = "auto", threads: int = 0) -> Physics:
+    """Return the physics that a configuration describes; `threads` is as in Physics."""
+    return Physics(c.robot, c.physics, resolve_engine(engine), threads)

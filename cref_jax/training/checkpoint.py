@@ -27,8 +27,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
-from cref_jax import leaves
 from cref_jax.errors import CheckpointError, DamagedCheckpoint
+from cref_jax.training import pytree_digest
 
 LOG = logging.getLogger(__name__)
 SCHEMA = 1  # one more whenever this program would misread a step of the next one
@@ -90,8 +90,8 @@ class Checkpoints:
         Raises:
             CheckpointError: the disk refused, or the directory holds the steps of another run.
         """
-        host = leaves.on_host(carry)
-        index = leaves.described(carry, host)
+        host = pytree_digest.on_host(carry)
+        index = pytree_digest.describe(carry, host)
         if iteration == self._stands_on and self._holds(iteration, index):
             return
         own = {"schema": SCHEMA, "iteration": iteration, "versions": _versions()}
@@ -129,7 +129,7 @@ class Checkpoints:
             DamagedCheckpoint: the files are not what was written.
             CheckpointError: no step, a newer schema, or a leaf of another shape or dtype.
         """
-        every = leaves.by_path(like)
+        every = pytree_digest.by_path(like)
         unknown = [part for part in parts or () if not any(_within(p, [part]) for p in every)]
         if unknown:
             raise CheckpointError(f"the state has no part '{unknown[0]}'")
@@ -137,7 +137,7 @@ class Checkpoints:
         loaded = self._load(wanted, parts, step, allow_fallback)
         self._stands_on = loaded.step
         self._warn_if_moved(loaded)
-        return leaves.filled(like, loaded.arrays), _public(loaded.record)
+        return pytree_digest.fill_from(like, loaded.arrays), _public(loaded.record)
 
     def restore_part(
         self, name: str, like: PyTree, step: int | None = None, allow_fallback: bool = False
@@ -146,8 +146,8 @@ class Checkpoints:
 
         `like` has the structure of the part; what `jax.eval_shape` returns will do.
         """
-        loaded = self._load(leaves.by_path(like, name), (name,), step, allow_fallback)
-        return leaves.filled(like, loaded.arrays, name)
+        loaded = self._load(pytree_digest.by_path(like, name), (name,), step, allow_fallback)
+        return pytree_digest.fill_from(like, loaded.arrays, name)
 
     def _write(self, iteration: int, host: dict[str, np.ndarray], record: dict[str, Any]) -> None:
         """Write beside the other steps, then rename: a kill at any time costs one save at most."""
@@ -240,7 +240,7 @@ class Checkpoints:
         record = self._record(step)
         index = {key: leaf for key, leaf in record["leaves"].items() if _within(key, parts)}
         _compare(path, wanted, index)
-        empty = {key: leaves.empty(like) for key, like in wanted.items() if 0 in like.shape}
+        empty = {key: pytree_digest.empty(like) for key, like in wanted.items() if 0 in like.shape}
         stored = {key: 0 for key in wanted if key not in empty}
         request = ocp.args.PyTreeRestore(
             item=stored,
@@ -253,10 +253,11 @@ class Checkpoints:
             raise DamagedCheckpoint(f"{path}: damaged: {_line(error)}") from error
         host = {key: np.asarray({**found, **empty}.get(key)) for key in index}
         for key, leaf in index.items():
-            if leaves.bits_digest(host[key]) != leaf["sha256"]:
+            if pytree_digest.bits_digest(host[key]) != leaf["sha256"]:
                 raise DamagedCheckpoint(f"{path}: damaged: the digest of {key} differs")
         arrays = {
-            key: leaves.placed(host[key], like, index[key]["impl"]) for key, like in wanted.items()
+            key: pytree_digest.put_like(host[key], like, index[key]["impl"])
+            for key, like in wanted.items()
         }
         return Loaded(step, arrays, record)
 

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float16
 
-from cref_jax import config, depth, network, ppo, rollout
+from cref_jax import config, depth, network, ppo
 from cref_jax.env import observations
 from cref_jax.env.world import World
 from cref_jax.robot import Robot
+from cref_jax.training import rollout
 
 STEPS = 64  # of the test vectors, in two episodes of half as many
 HOLES = (slice(8, 16), slice(20, 44))  # rows and columns of one frame that are 0, or NaN below
@@ -76,8 +77,8 @@ def record(world: World, train: ppo.TrainState, steps: int, key: Array) -> Recor
 
     def step(robots: rollout.Robots, _: None) -> tuple[rollout.Robots, Recorded]:
         nets, feed = rollout.networks(world.config.network, len(nominal)), robots.feed
-        memory, policy = rollout.act(nets, train, robots)
-        after, _outcome = rollout.advance(world, robots, memory, policy.mean[0])
+        memory, policy = rollout.policy_step(nets, train, robots)
+        after, _outcome = rollout.env_step(world, robots, memory, policy.mean[0])
         part = {name: robots.observation.proprioception[0, at] for name, at in where.items()}
         return after, Recorded(
             angular_velocity=part["angular_velocity"],
@@ -113,11 +114,11 @@ def reference(
     )
     if steps.image is not None:
         start = start._replace(features=network.no_features(c, steps.image.shape[1:], 1))
-    step = functools.partial(_said, actor, train, robot, limits)
+    step = functools.partial(_reference_step, actor, train, robot, limits)
     return jax.jit(lambda steps: jax.lax.scan(step, start, steps)[1])(steps)
 
 
-def _said(
+def _reference_step(
     actor: network.Actor,
     train: ppo.TrainState,
     robot: Robot,
@@ -156,12 +157,12 @@ def _said(
         "gru": carry.gru[None],
         "previous_action": action[None, None],
         "target": (robot.nominal_pose + robot.action_scale * action)[None, None],
-        **_seen(features, seen, part, output),
+        **_sensed(features, seen, part, output),
     }
     return _Held(carry, features, seen, action), {k: x[0, 0] for k, x in tensors.items()}
 
 
-def _seen(
+def _sensed(
     features: network.Features | None,
     seen: Bool[Array, " 1"],
     part: dict[str, Any],

@@ -17,10 +17,11 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, PyTree
 
-from cref_jax import mirror, ppo, ramp, rollout
+from cref_jax import ppo
 from cref_jax.env.world import World
 from cref_jax.ppo import Losses
-from cref_jax.ramp import Ramp
+from cref_jax.training import mirror, randomization_ramp, rollout
+from cref_jax.training.randomization_ramp import Ramp
 
 Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
 
@@ -49,7 +50,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     key_robots, key_params = jax.random.split(jax.random.key(c.run.seed))
 
     def start(world: World, key: Array) -> rollout.Robots:
-        robots = rollout.start(world, _own(key), c.run.num_envs // mesh.size)
+        robots = rollout.start(world, _device_key(key), c.run.num_envs // mesh.size)
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
     shared = jax.shard_map(
@@ -67,7 +68,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     train = ppo.initial_state(params, *sizes, c.ppo)
     whole = NamedSharding(mesh, P())
     train, growing = jax.lax.with_sharding_constraint(
-        (train, ramp.begun(c.randomisation)), (whole, whole)
+        (train, randomization_ramp.initial_ramp(c.randomisation)), (whole, whole)
     )
     return RunState(train, robots, growing)
 
@@ -101,8 +102,8 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         nets = nets._replace(mirror=mirror.of(world.physics.model, c.network))
 
     def learn(world: World, state: RunState, key: Array) -> tuple[RunState, Losses, rollout.Trace]:
-        key_act, key_update = jax.random.split(_own(key))
-        robots = rollout.hardened(state.robots, state.ramp.share)
+        key_act, key_update = jax.random.split(_device_key(key))
+        robots = rollout.with_randomization(state.robots, state.ramp.share)
         robots, experience, trace = rollout.collect(world, nets, state.train, robots, key_act)
         train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions, AXIS)
         return state.replace(train=train, robots=robots), losses, trace
@@ -119,10 +120,10 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     std = jnp.maximum(std, c.network.min_std)
     state, losses, trace = shared(world, state, key)
     falls = trace.ending.terminated.mean() * (60.0 / c.physics.control_period)
-    state = state.replace(ramp=ramp.advanced(state.ramp, falls, c.randomisation))
+    state = state.replace(ramp=randomization_ramp.update_ramp(state.ramp, falls, c.randomisation))
     samples = state.train.iteration * (c.run.num_envs * c.ppo.horizon)
     log = {
-        **_episodes(trace, world.lanes.kinds, c.physics.control_period),
+        **_episode_log(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
@@ -140,12 +141,12 @@ def partition(world: World) -> RunState:
     return RunState(train=P(), robots=robots, ramp=P())
 
 
-def _own(key: Array) -> Array:
+def _device_key(key: Array) -> Array:
     """Return this device's own key."""
     return jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
 
-def _episodes(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:
+def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:
     """Return how the robots walk, and how the episodes that ended did, by kind of terrain.
 
     `period` is the length of a control step, s.

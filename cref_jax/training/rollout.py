@@ -4,7 +4,6 @@ Training and evaluation share it. The robots' axis is E, and every record is [T,
 cameras run on one clock: a clock of its own for each robot would render every image at 50 Hz.
 """
 
-import functools
 from typing import NamedTuple, no_type_check
 
 import flax.struct
@@ -21,22 +20,8 @@ from cref_jax.env.observations import Observation
 from cref_jax.env.state import Ending, EnvState, even_spread
 from cref_jax.env.world import World
 from cref_jax.ppo import auxiliary
-from cref_jax.system import xla_kernels
-
-
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
-@flax.struct.dataclass
-class Feed:
-    """What the cameras have delivered."""
-
-    frame: Float16[Array, "E rows columns pixels"]  # D, the last that came, see network.in_patches
-    seen: Bool[Array, " E"]  # it is of this episode
-    fresh: Bool[Array, ""]  # it came in the last step
-    clock: Int[Array, ""]  # control steps since the cameras were started
-
-    def images(self, c: config.Network) -> Float16[Array, "E H W"]:
-        """Return the frames as images."""
-        return network.as_image(c, self.frame)
+from cref_jax.training import camera_feed
+from cref_jax.training.camera_feed import CameraFeed
 
 
 class Memory(NamedTuple):
@@ -56,7 +41,7 @@ class Robots:
     observation: Observation
     memory: Memory
     begins: Bool[Array, " E"]  # the next step is the first of an episode
-    feed: Feed | None = None  # None for a blind policy
+    feed: CameraFeed | None = None  # None for a blind policy
 
 
 class Networks(NamedTuple):
@@ -102,7 +87,7 @@ def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Rob
         observation=robots,
         memory=memory._replace(twin=memory if has_twin else None),
         begins=robots,
-        feed=Feed(frame=robots, seen=robots, fresh=P(), clock=P()) if sees else None,
+        feed=CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P()) if sees else None,
     )
 
 
@@ -144,10 +129,10 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
     state = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0))(world, split(key_reset), kinds, levels)
     longest = round(c.episode.length / c.physics.control_period)
     state = state.replace(step=jax.random.randint(key_step, (num_envs,), 0, longest))
-    return placed(world, state, split(key_see))
+    return init_robots(world, state, split(key_see))
 
 
-def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
+def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
     """Return the robots in these states, with nothing seen or remembered; a key for each."""
     c, num_envs = world.config, state.kind.shape[0]
     seen = jax.vmap(environment.observe, in_axes=(None, 0, 0))(world, state, keys)
@@ -160,11 +145,11 @@ def placed(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
             network.no_features(c.network, c.camera.shape, num_envs) if sees else None,
         ),
         begins=jnp.ones(num_envs, bool),
-        feed=_first_feed(c, num_envs) if sees else None,
+        feed=camera_feed.empty_feed(c, num_envs) if sees else None,
     )
 
 
-def hardened(robots: Robots, share: Float[Array, ""]) -> Robots:
+def with_randomization(robots: Robots, share: Float[Array, ""]) -> Robots:
     """Return the robots with this share of all that is randomised from the next draw on."""
     spread = even_spread(jnp.broadcast_to(share, robots.begins.shape))
     return robots.replace(env=robots.env.replace(spread=spread))
@@ -176,27 +161,31 @@ def with_twins(robots: Robots) -> Robots:
     return robots.replace(memory=robots.memory._replace(twin=blank))
 
 
-def act(nets: Networks, train: ppo.TrainState, robots: Robots) -> tuple[Memory, network.Output]:
+def policy_step(
+    nets: Networks, train: ppo.TrainState, robots: Robots
+) -> tuple[Memory, network.Output]:
     """Return the policy's memory after this step and its outputs, [1, E, ...].
 
     A frame is encoded when it comes, and its features are held until the next one. Where the policy
     is taught symmetry, its twin senses and sees the same in the mirror, and remembers that.
     """
     seen, feed, memory = robots.observation.proprioception, robots.feed, robots.memory
-    after, output = _think(nets, train, robots.begins, seen, feed, memory)
+    after, output = _apply_actor(nets, train, robots.begins, seen, feed, memory)
     if nets.mirror is not None and memory.twin is not None:
         reflected = feed and feed.replace(frame=nets.mirror.frames(feed.frame))
-        twin, _ = _think(nets, train, robots.begins, nets.mirror.obs(seen), reflected, memory.twin)
+        twin, _ = _apply_actor(
+            nets, train, robots.begins, nets.mirror.obs(seen), reflected, memory.twin
+        )
         after = after._replace(twin=twin)
     return after, output
 
 
-def _think(
+def _apply_actor(
     nets: Networks,
     train: ppo.TrainState,
     begins: Bool[Array, " E"],
     proprioception: Float[Array, "E O"],
-    feed: Feed | None,
+    feed: CameraFeed | None,
     memory: Memory,
 ) -> tuple[Memory, network.Output]:
     """Do what `act` does for one memory."""
@@ -213,40 +202,14 @@ def _think(
     return Memory(carry, features), output
 
 
-def advance(
+def env_step(
     world: World, robots: Robots, memory: Memory, action: Float[Array, "E J"]
 ) -> tuple[Robots, Outcome]:
     """Step every robot with its action, and its camera."""
     state, outcome = environment.step_all(world, robots.env, action)
     over = outcome.ending.terminated | outcome.ending.truncated
-    feed = robots.feed and _next_feed(world, robots.feed, robots.env, over)
+    feed = robots.feed and camera_feed.update_feed(world, robots.feed, robots.env, over)
     return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome
-
-
-def exposed(world: World, state: EnvState) -> Float16[Array, "E rows columns pixels"]:
-    """Return what all cameras see, in the order in which the network reads it.
-
-    `start` puts the robots on the kinds of lane in turn, for good: so it is known beforehand which
-    of them stand on lanes that are level across, and these images cost less.
-    """
-    kinds = world.lanes.kind_of(np.arange(state.kind.shape[0]))
-    is_profile = np.asarray(world.lanes.is_profile)[kinds]
-    robots, images = [], []
-    for flag in (True, False):
-        some = np.flatnonzero(is_profile == flag)
-        if some.size:
-            part = jax.tree.map(lambda x, some=some: x[some], state)
-            look = xla_kernels.as_own_kernel(functools.partial(_images, is_profile=flag))
-            images.append(xla_kernels.materialize(look(world, part)))
-            robots.append(some)
-    image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
-    return network.in_patches(world.config.network, image)
-
-
-def _images(world: World, state: EnvState, is_profile: bool) -> Float16[Array, "E H W"]:
-    """Return what cameras see that are all on lanes level across, or all not."""
-    look = functools.partial(environment.depth_image, is_profile=is_profile)
-    return jax.vmap(look, in_axes=(None, 0))(world, state).astype(jnp.float16)
 
 
 def collect(
@@ -262,38 +225,38 @@ def collect(
     if robots.feed is not None:
         robots = robots.replace(feed=robots.feed.replace(fresh=jnp.ones((), bool)))
 
-    def step(watch: _Watch, noise: Float[Array, "E J"]) -> tuple[_Watch, _Step]:
+    def step(watch: _Collection, noise: Float[Array, "E J"]) -> tuple[_Collection, _Step]:
         robots = watch.robots
-        memory, policy = act(nets, train, robots)
+        memory, policy = policy_step(nets, train, robots)
         mean = policy.mean[0]
         action = mean + jnp.exp(policy.log_std) * noise
-        after, outcome = advance(world, robots, memory, action)
+        after, outcome = env_step(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
         seen = robots.feed and robots.feed.seen
         done = _Step(
             robots.observation, robots.begins, action, mean, log_std, outcome, watch.held, seen
         )
-        return _filed(watch.replace(robots=after)), done
+        return _store_frame(watch.replace(robots=after)), done
 
     keys = jax.random.split(key, c.ppo.horizon)
     draw = lambda key: jax.random.normal(key, robots.env.action.shape)
-    watch, steps = jax.lax.scan(step, _opened(c, robots), jax.vmap(draw)(keys))
+    watch, steps = jax.lax.scan(step, _start_buffer(c, robots), jax.vmap(draw)(keys))
     after = watch.robots
-    after = after.replace(memory=_without_features(after.memory))
-    rollout = _rollout(c, nets, train, first.memory, watch.album, steps)
+    after = after.replace(memory=_clear_features(after.memory))
+    rollout = _to_rollout(c, nets, train, first.memory, watch.album, steps)
     outcome = steps.outcome
     return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
 
 
-def _without_features(memory: Memory) -> Memory:
+def _clear_features(memory: Memory) -> Memory:
     """Return what is remembered, with blank features of the frame at hand."""
-    twin = memory.twin and _without_features(memory.twin)
+    twin = memory.twin and _clear_features(memory.twin)
     return memory._replace(features=jax.tree.map(jnp.zeros_like, memory.features), twin=twin)
 
 
 @no_type_check
 @flax.struct.dataclass
-class _Watch:
+class _Collection:
     """The robots during a horizon, and the frames that have come so far."""
 
     robots: Robots
@@ -301,17 +264,17 @@ class _Watch:
     held: Int[Array, ""]  # where the frame at hand is in the album
 
 
-def _opened(c: config.Config, robots: Robots) -> _Watch:
+def _start_buffer(c: config.Config, robots: Robots) -> _Collection:
     """Return the start of a horizon: the frame at hand is the album's first."""
     album = None
     if robots.feed is not None:
         count = 1 + depth.most_frames(c.ppo.horizon - 1, c.camera, c.physics.control_period)
         album = jnp.zeros((count, *robots.feed.frame.shape), robots.feed.frame.dtype)
         album = album.at[0].set(robots.feed.frame)
-    return _Watch(robots, album, jnp.zeros((), jnp.int32))
+    return _Collection(robots, album, jnp.zeros((), jnp.int32))
 
 
-def _filed(watch: _Watch) -> _Watch:
+def _store_frame(watch: _Collection) -> _Collection:
     """Put a frame that has just come into the album; one after the last step is the next's."""
     feed, album = watch.robots.feed, watch.album
     if feed is None or album is None:
@@ -321,7 +284,7 @@ def _filed(watch: _Watch) -> _Watch:
     return watch.replace(album=jax.lax.cond(feed.fresh, add, lambda: album), held=held)
 
 
-def _rollout(
+def _to_rollout(
     c: config.Config,
     nets: Networks,
     train: ppo.TrainState,
@@ -356,26 +319,3 @@ def _rollout(
         sight=sight,
         twin=memory.twin and memory.twin.carry,
     )
-
-
-def _first_feed(c: config.Config, num_envs: int) -> Feed:
-    """Return the state of cameras that have delivered nothing."""
-    blank = jnp.zeros((num_envs, *c.camera.shape), jnp.float16)  # 16 bits: to 0.4 mm at 3 m
-    return Feed(
-        frame=network.in_patches(c.network, blank),
-        seen=jnp.zeros(num_envs, bool),
-        fresh=jnp.zeros((), bool),
-        clock=jnp.zeros((), jnp.int32),
-    )
-
-
-def _next_feed(world: World, feed: Feed, before: EnvState, over: Bool[Array, " E"]) -> Feed:
-    """Return what has been delivered after the step that led away from the states `before`.
-
-    A frame shows the robot one control step earlier: it is 20 ms old when the policy first uses it
-    (assumed). One that was exposed before the end of an episode is not shown to the next.
-    """
-    c, clock = world.config, feed.clock + 1
-    due = depth.is_due(clock, c.camera, c.physics.control_period)
-    frame = jax.lax.cond(due, lambda: exposed(world, before), lambda: feed.frame)
-    return Feed(frame=frame, seen=(feed.seen | due) & ~over, fresh=due, clock=clock)

@@ -34,7 +34,7 @@ def by_path(tree: PyTree, name: str = "") -> dict[str, Any]:
     return found
 
 
-def filled(like: PyTree, arrays: dict[str, Any], name: str = "") -> PyTree:
+def fill_from(like: PyTree, arrays: dict[str, Any], name: str = "") -> PyTree:
     """Return `like` with the leaves that `arrays` has, paths as in `by_path`."""
     return jax.tree_util.tree_map_with_path(
         lambda keys, leaf: arrays.get(_path(keys, name), leaf), like
@@ -47,7 +47,7 @@ def on_host(tree: PyTree) -> dict[str, np.ndarray]:
     return {path: np.asarray(leaf) for path, leaf in host.items()}
 
 
-def placed(array: np.ndarray, like: Any, impl: str) -> Any:
+def put_like(array: np.ndarray, like: Any, impl: str) -> Any:
     """Return `array` as the kind of leaf that `like` is, on its devices.
 
     `impl` names the generator if the leaf is a random key, and is empty otherwise.
@@ -65,7 +65,7 @@ def empty(like: Any) -> np.ndarray:
     return np.zeros(bits.shape, bits.dtype)
 
 
-def described(tree: PyTree, host: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+def describe(tree: PyTree, host: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     """Return shape, dtype, generator and SHA-256 of every leaf; `host` is what `on_host` gave."""
     return {
         path: {

@@ -11,11 +11,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from cref_jax import config, learn, leaves
+from cref_jax import config
 from cref_jax.config import Config
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.runs import Policy
+from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import iteration, pytree_digest
 
 _SETTINGS, _ITERATION = "settings", "iterations"  # names that no leaf has
 
@@ -25,13 +26,13 @@ def is_learner(path: Path) -> bool:
     return path.suffix == ".npz"
 
 
-def write(policy: Policy, out: Path) -> None:
+def write(policy: TrainedPolicy, out: Path) -> None:
     """Write actor, critic, optimiser and statistics, and the settings of the run.
 
     Raises:
         ConfigError: the disk refused.
     """
-    arrays = leaves.on_host(policy.train)
+    arrays = pytree_digest.on_host(policy.train)
     arrays[_SETTINGS] = np.array(json.dumps(dataclasses.asdict(policy.config)))
     arrays[_ITERATION] = np.array(policy.iteration)
     try:
@@ -51,19 +52,19 @@ def read_config(path: Path) -> Config:
     return config.override(Config(), json.loads(str(_arrays(path)[_SETTINGS])))
 
 
-def read(path: Path, world: World) -> Policy:
+def read(path: Path, world: World) -> TrainedPolicy:
     """Return what was learned; `world` may have another terrain.
 
     Raises:
         ConfigError: it is no such file, or the network is another one.
     """
     arrays, c = _arrays(path), read_config(path)
-    like = jax.eval_shape(lambda w: learn.initial_state(w).train, world)
-    for name, leaf in leaves.by_path(like).items():
+    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
+    for name, leaf in pytree_digest.by_path(like).items():
         if name not in arrays or arrays[name].shape != leaf.shape:
             raise ConfigError(f"{path} does not fit these settings: {name} is not {leaf.shape}")
     placed = {name: jax.numpy.asarray(x) for name, x in arrays.items() if name != _SETTINGS}
-    return Policy(c, leaves.filled(like, placed), int(arrays[_ITERATION]), path)
+    return TrainedPolicy(c, pytree_digest.fill_from(like, placed), int(arrays[_ITERATION]), path)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

@@ -24,13 +24,13 @@ class Ramp:
     falls: Float[Array, ""]  # per minute and robot, over the last iterations
 
 
-def begun(c: config.Randomisation) -> Ramp:
+def initial_ramp(c: config.Randomisation) -> Ramp:
     """Begin with nothing randomised, or with everything where there is no ramp."""
     low, high = c.ramp_falls
     return Ramp(jnp.float32(0.0 if c.ramp else 1.0), jnp.float32(0.5 * (low + high)))
 
 
-def advanced(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:
+def update_ramp(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:
     """Raise the share after few falls per minute, lower it after many, and keep it in between."""
     if not c.ramp:
         return ramp

@@ -1,0 +1,197 @@
+"""The manifest of an exported policy: everything but the weights, with units and frames."""
+
+import dataclasses
+import datetime
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cref_jax import config, deploy, ppo, robot
+from cref_jax.config import Config
+from cref_jax.policy.trained import TrainedPolicy
+
+HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
+STALE = 0.1  # s, two frames of the camera
+MOST_INVALID = 0.5  # of a frame's pixels; assumed: beyond, the last frame tells more
+
+
+def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]:
+    """Return everything but the weights, without digests."""
+    c = policy.config
+    return {
+        "format": "cref-policy",
+        "schema": deploy.SCHEMA,
+        "rates": {
+            "control_hz": 1.0 / c.physics.control_period,
+            "depth_hz": c.camera.rate,
+            "frame_age_s": c.physics.control_period,
+        },
+        "joints": _joints(driven),
+        "held_joints": _held(c, driven),
+        "action": _action(c),
+        "observation": _observation(policy.train, driven),
+        "command": _command(c),
+        "depth": None if c.network.variant == "blind" else _depth(c),
+        "network": _network(c.network),
+        "state": _state(c.network),
+        "guards": _guards(driven),
+        "provenance": _provenance(policy),
+        "evaluation": _evaluation(policy.run),
+    }
+
+
+def _joints(driven: robot.Robot) -> list[dict[str, Any]]:
+    """Return the joints that the policy drives, in the order of every array."""
+    columns = {
+        "default_rad": driven.nominal_pose,
+        "action_scale_rad": driven.action_scale,
+        "low_rad": driven.range_low,
+        "high_rad": driven.range_high,
+        "velocity_rad_s": driven.velocity_limit,
+        "kp": driven.kp,
+        "kd": driven.kd,
+        "effort_nm": driven.effort,
+    }
+    return [
+        {"name": name, **{key: float(values[j]) for key, values in columns.items()}}
+        for j, name in enumerate(driven.joint_names)
+    ]
+
+
+def _held(c: Config, driven: robot.Robot) -> list[dict[str, Any]]:
+    """Return the joints that the robot itself has to hold at their default."""
+    whole = robot.load(dataclasses.replace(c.robot, actuated="all"))
+    keys = ("name", "default_rad", "kp", "kd", "effort_nm")
+    return [
+        {key: joint[key] for key in keys}
+        for joint in _joints(whole)
+        if joint["name"] not in driven.joint_names
+    ]
+
+
+def _action(c: Config) -> dict[str, Any]:
+    return {
+        "clip": c.robot.action_clip,
+        "formula": "target = default_rad + action_scale_rad * clip(action, -clip, clip)",
+        "torque": "clip(kp (target - q) - kd qd, -effort_nm, effort_nm)",
+    }
+
+
+def _observation(train: ppo.TrainState, driven: robot.Robot) -> dict[str, Any]:
+    joints, statistics = len(driven.joint_names), train.statistics.obs
+    base = "base: x forward, y left, z up"
+    terms = [
+        ("angular_velocity", 3, "rad/s", base),
+        ("gravity", 3, "unit vector; (0, 0, -1) upright", base),
+        ("command", 3, "m/s forward, m/s to the left, rad/s to the left", base),
+        ("joint_position", joints, "rad from default_rad", "joints"),
+        ("joint_velocity", joints, "rad/s", "joints"),
+        ("action", joints, "the clipped action of the step before; 0 at first", "joints"),
+    ]
+    return {
+        "terms": [dict(zip(("name", "size", "unit", "frame"), t, strict=True)) for t in terms],
+        "formula": "clip((x - mean) / std, -clip, clip)",
+        "mean": [float(x) for x in np.asarray(statistics.mean, np.float32)],
+        "std": [float(x) for x in np.asarray(statistics.std, np.float32)],
+        "clip": ppo.OBSERVATION_CLIP,
+    }
+
+
+def _command(c: Config) -> dict[str, Any]:
+    """Return the commands that were trained, in the open and along lanes."""
+    turn = max(c.command.lane_yaw_rate, *map(abs, c.command.yaw_rate))
+    forward = (*c.command.vx, *c.command.lane_vx)
+    return {
+        "low": [min(forward), c.command.vy[0], -turn],
+        "high": [max(forward), c.command.vy[1], turn],
+    }
+
+
+def _depth(c: Config) -> dict[str, Any]:
+    whole = dataclasses.replace(c.robot, actuated="all")
+    mount = robot.load(whole).camera
+    model = robot.spec("all", c.physics, contact_planes=0).compile()
+    rows, columns = c.camera.shape
+    return {
+        "rows": rows,
+        "columns": columns,
+        "view_deg": {"vertical": c.camera.view[0], "horizontal": c.camera.view[1]},
+        "orientation": "row 0 is the top, column 0 the left; depth along the optical axis, m",
+        "mount": {
+            "link": model.body(mount.body).name,
+            "position_m": [float(x) for x in mount.position],
+            "rotation_wxyz": [float(x) for x in mount.rotation],
+            "pitch_deg": c.camera.pitch,
+        },
+        "d_max_m": c.camera.d_max,
+        "invalid": "0 and NaN are filled in from around; infinity and beyond d_max read as d_max",
+        "window": c.camera.window,
+        "resize": "the pixel nearest to each cell's middle, of an image with this view; a RealSense"
+        " D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees",
+        "formula": "float16(nearest / d_max - 0.5), nearest: of window x window pixels around",
+    }
+
+
+def _network(c: config.Network) -> dict[str, Any]:
+    keys = ("channels", "kernel", "stride")
+    return {
+        "variant": c.variant,
+        "convolutions": [dict(zip(keys, layer, strict=True)) for layer in c.convolutions],
+        "token": c.token,
+        "heads": c.heads,
+        "compressed": c.compressed,
+        "lstm": c.lstm,
+        "gru": c.gru,
+        "actor": list(c.actor),
+        "activation": "elu",
+        "norm_epsilon": 1e-6,
+    }
+
+
+def _state(c: config.Network) -> dict[str, Any]:
+    return {
+        "lstm_c": [c.lstm],
+        "lstm_h": [c.lstm],
+        "gru": [c.gru],
+        "reset": "all zero, and no frame",
+    }
+
+
+def _guards(driven: robot.Robot) -> dict[str, Any]:
+    """Return the limits of the runtime; those on targets only take what the motors cannot do.
+
+    A target that is further from the pose than this asks for no more torque, at whatever speed.
+    """
+    reach = [float(x) for x in (driven.effort + driven.kd * driven.velocity_limit) / driven.kp]
+    return {
+        "hold_steps": HOLD_STEPS,
+        "stale_s": STALE,
+        "max_invalid": MOST_INVALID,
+        "rate_rad": [2.0 * x for x in reach],
+        "beyond_rad": reach,
+    }
+
+
+def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
+    """Return where the policy comes from; the last start of its run stands for all of them."""
+    c, origin = policy.config, policy.run / "origin.jsonl"
+    lines = origin.read_text().splitlines() if origin.is_file() else []
+    start = json.loads(lines[-1]) if lines else {"command": []}
+    bare = lambda word: Path(word).name if Path(word).is_absolute() else word  # no one's folders
+    start["command"] = [bare(word) for word in start["command"]]
+    return {
+        "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "run": policy.run.name,
+        "iteration": policy.iteration,
+        "samples": policy.samples,
+        "trained_by": start,
+        "config": json.loads(json.dumps(dataclasses.asdict(c))),
+    }
+
+
+def _evaluation(run: Path) -> dict[str, Any] | None:
+    """Return what `make eval` has last said of the run."""
+    path = run / "eval.json"
+    return json.loads(path.read_text()) if path.is_file() else None

@@ -1,0 +1,68 @@
+"""An exported policy, read back to be evaluated in JAX."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cref_jax import config, deploy
+from cref_jax.config import Config
+from cref_jax.env.world import World, build_world
+from cref_jax.errors import ConfigError
+from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import iteration, pytree_digest
+
+
+def read(path: Path, world: World | None = None) -> TrainedPolicy:
+    """Return an exported policy as one to evaluate in JAX; its critic is not in it, so it is zero.
+
+    Raises:
+        ConfigError: it is not a policy that this program can read.
+    """
+    content, arrays = read_contents(path)
+    c = trained_config(content)
+    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world or build_world(c))
+    train = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    actor = pytree_digest.fill_from(
+        train.params.actor, {f"params/{k}": jnp.array(x) for k, x in arrays.items()}
+    )
+    seen = content["observation"]
+    obs = train.statistics.obs.replace(mean=jnp.array(seen["mean"]), std=jnp.array(seen["std"]))
+    train = train.replace(
+        params=train.params._replace(actor=actor),
+        statistics=train.statistics._replace(obs=obs),
+    )
+    return TrainedPolicy(c, train, content["provenance"]["iteration"], path)
+
+
+def digest(policy: TrainedPolicy) -> str:
+    """Return the SHA-256 of all that decides what a policy does, the same for run and export."""
+    c = policy.config
+    settings = [dataclasses.asdict(part) for part in (c.network, c.robot, c.camera)]
+    found = hashlib.sha256(json.dumps(settings).encode())
+    arrays = pytree_digest.on_host(policy.train.params.actor["params"])
+    seen = policy.train.statistics.obs
+    for name, array in sorted({**arrays, "mean": seen.mean, "std": seen.std}.items()):
+        found.update(name.encode())
+        found.update(np.ascontiguousarray(array, np.float32).tobytes())
+    return found.hexdigest()
+
+
+def read_contents(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return an exported policy's manifest and weights, every number checked."""
+    try:
+        content, arrays = deploy.contents(path)
+        deploy.Policy(content, arrays)
+    except deploy.PolicyFormatError as error:
+        raise ConfigError(str(error)) from None
+    return content, arrays
+
+
+def trained_config(content: dict[str, Any]) -> Config:
+    """Return the settings that an exported policy was trained with, from its manifest."""
+    return config.override(Config(), content["provenance"]["config"])

@@ -1,0 +1,69 @@
+"""A trained policy as a directory that needs nothing of this package, and back.
+
+manifest.json      everything but the weights, with units, frames and where it comes from
+weights.npz        float32 by flat names, stored
+testvectors.npz    what the network said in training: see vectors.py
+cref_runtime.py    deploy.py, which runs the policy with numpy alone
+"""
+
+import contextlib
+from pathlib import Path
+
+from cref_jax.config import Config, folders
+from cref_jax.env.world import World
+from cref_jax.errors import ConfigError
+from cref_jax.policy import learner_file, reader, trained
+from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import run_dir
+
+BUNDLED = "mixed"  # the policy that comes with the package
+
+
+def resolve_policy(run: Path | None, policy: Path | None) -> Path:
+    """Return the run or the exported policy to look at: the newest run, or the bundled policy.
+
+    Raises:
+        ConfigError: both are given.
+    """
+    if run and policy:
+        raise ConfigError("give --run or --policy, not both")
+    with contextlib.suppress(ConfigError):
+        return run or policy or run_dir.newest()
+    return bundled_policy()
+
+
+def bundled_policy() -> Path:
+    """Return the policy that comes with the package."""
+    return folders.data_folder("policies") / BUNDLED
+
+
+def is_run(path: Path) -> bool:
+    """Return whether this is a run and not an exported policy."""
+    return path.suffix not in (".zip", ".npz") and not (path / "manifest.json").is_file()
+
+
+def read_config(path: Path) -> Config:
+    """Return the settings that a run, what it has learned, or an exported policy was trained with.
+
+    Raises:
+        ConfigError: it is none of these.
+    """
+    if learner_file.is_learner(path):
+        return learner_file.read_config(path)
+    return (
+        run_dir.read_config(path)
+        if is_run(path)
+        else reader.trained_config(reader.read_contents(path)[0])
+    )
+
+
+def load(path: Path, world: World) -> TrainedPolicy:
+    """Return the policy of a run, of what it has learned, or an exported one, to evaluate in JAX.
+
+    Raises:
+        ConfigError: it is none of these.
+        CheckpointError: the run has no checkpoint that can be read.
+    """
+    if learner_file.is_learner(path):
+        return learner_file.read(path, world)
+    return trained.load_policy(path, world) if is_run(path) else reader.read(path, world)

@@ -1,0 +1,45 @@
+"""A trained policy, and how it is loaded from a run."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from cref_jax import ppo
+from cref_jax.config import Config
+from cref_jax.env.world import World
+from cref_jax.training import iteration, run_dir
+
+
+class TrainedPolicy(NamedTuple):
+    """A trained policy and how it came about."""
+
+    config: Config
+    train: ppo.TrainState
+    iteration: int
+    run: Path
+
+    @property
+    def samples(self) -> int:
+        """Control steps of experience that it has learned from."""
+        return self.iteration * self.config.run.num_envs * self.config.ppo.horizon
+
+
+def load_policy(run: Path, world: World) -> TrainedPolicy:
+    """Return the newest policy of a run; `world` may have another terrain than it was trained on.
+
+    Raises:
+        ConfigError: there is no such run.
+        CheckpointError: it has no checkpoint that can be read.
+    """
+    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
+    c = run_dir.read_config(run)
+    with run_dir.checkpoints(run) as steps:
+        newest = steps.latest()
+        train = steps.restore_part("train", like, newest)
+        return TrainedPolicy(c, with_averaged_actor(train), newest or 0, run)
+
+
+def with_averaged_actor(train: ppo.TrainState) -> ppo.TrainState:
+    """Return the state whose actor is the average: the policy that is evaluated and exported."""
+    return train.replace(params=train.params._replace(actor=train.average))

@@ -1,0 +1,88 @@
+"""A trained policy as a directory that needs nothing of this package.
+
+manifest.json      everything but the weights, with units, frames and where it comes from
+weights.npz        float32 by flat names, stored
+testvectors.npz    reference inputs and outputs of the trained network
+cref_runtime.py    deploy.py, which runs the policy with numpy alone
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cref_jax import deploy
+from cref_jax.env.world import World
+from cref_jax.errors import ConfigError
+from cref_jax.policy import reader, reference_vectors
+from cref_jax.policy.manifest import build_manifest
+from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import pytree_digest
+
+ZIPPED = (1980, 1, 1, 0, 0, 0)  # date of every file: equal policies are equal bytes
+
+
+def write(policy: TrainedPolicy, world: World, out: Path) -> None:
+    """Write the directory, and beside it the same as one .zip.
+
+    Raises:
+        ConfigError: the disk refused, or another file stands there.
+    """
+    weights = pytree_digest.on_host(policy.train.params.actor["params"])
+    files = {
+        "weights.npz": _npz({k: x.astype(np.float32) for k, x in weights.items()}),
+        "testvectors.npz": _npz(reference_vectors.test_vectors(world, policy.train)),
+        "cref_runtime.py": Path(deploy.__file__).read_bytes(),
+    }
+    _write(out, build_manifest(policy, world.physics.robot), files)
+
+
+def refresh(path: Path) -> None:
+    """Give an exported policy the runtime of this version; all else stays as it is.
+
+    Raises:
+        ConfigError: it is no policy, or the disk refused.
+    """
+    content, _ = reader.read_contents(path)
+    if not path.is_dir():
+        raise ConfigError(f"{path} is not a directory")
+    files = {name: (path / name).read_bytes() for name in content["files"]}
+    files["cref_runtime.py"] = Path(deploy.__file__).read_bytes()
+    _write(path, content, files)
+
+
+def _write(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:
+    """Write the files and a manifest with their digests, and beside them one .zip."""
+    content["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+    content["digest"] = deploy.manifest_digest(content)
+    files["manifest.json"] = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            (out / name).write_bytes(data)
+        out.with_name(out.name + ".zip").write_bytes(_stored(files))
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}") from None
+
+
+def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+    """Return the arrays as an .npz without compression."""
+    files = {}
+    for name, array in sorted(arrays.items()):
+        data = io.BytesIO()
+        np.lib.format.write_array(data, np.ascontiguousarray(array), version=(1, 0))
+        files[f"{name}.npy"] = data.getvalue()
+    return _stored(files)
+
+
+def _stored(files: dict[str, bytes]) -> bytes:
+    """Return an archive of the files, without compression."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, ZIPPED), content)
+    return data.getvalue()

@@ -1,0 +1,113 @@
+"""What a run leaves on disk, and how a later program opens it again.
+
+runs/NAME/config.json     every setting, so that the run can be resumed or evaluated
+runs/NAME/origin.jsonl    versions, device, command line and git state at each start
+runs/NAME/log.jsonl       one line an iteration
+runs/NAME/tensorboard/    the same for TensorBoard
+runs/NAME/checkpoints/    see checkpoint.py
+"""
+
+import dataclasses
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from cref_jax import config
+from cref_jax.config import Config
+from cref_jax.errors import ConfigError
+from cref_jax.training.checkpoint import Checkpoints
+
+ROOT = Path("runs")
+
+
+def write_config(run: Path, c: Config) -> None:
+    """Write every setting of the run."""
+    (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+
+
+def write_origin(run: Path, iteration: int = 0) -> None:
+    """Add a line with what this start of the run is made by: versions, device, command, git.
+
+    `iteration` is how many are done before it.
+    """
+    line = {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "iteration": iteration,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "python": platform.python_version(),
+        **machine(),
+        "git": _git_state(),
+        **versions(),
+    }
+    with (run / "origin.jsonl").open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def machine() -> dict[str, Any]:
+    """Return what this program runs on."""
+    kind = jax.devices()[0].device_kind
+    return {"device": f"{jax.device_count()} x {kind}", "cores": os.cpu_count()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the packages that a result may depend on."""
+    packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    return {name: importlib.metadata.version(name) for name in packages}
+
+
+def read_config(run: Path) -> Config:
+    """Return the settings of a run.
+
+    Raises:
+        ConfigError: there is no such run, or its settings are of another version of the program.
+    """
+    path = run / "config.json"
+    try:
+        changes = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ConfigError(f"{run} is not a run: it has no config.json") from None
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    try:
+        return config.override(Config(), changes)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def newest(root: Path = ROOT) -> Path:
+    """Return the run with the newest checkpoint.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = [
+        path.parent for path in root.glob("*/checkpoints") if Checkpoints(path).latest() is not None
+    ]
+    if not found:
+        raise ConfigError(f"no trained run in {root}/; train one with: make train TERRAIN=flat")
+    return max(found, key=lambda run: (run / "checkpoints").stat().st_mtime)
+
+
+def checkpoints(run: Path, keep: int = 3) -> Checkpoints:
+    """Return the checkpoints of a run."""
+    return Checkpoints(run / "checkpoints", keep)
+
+
+def _git_state() -> str | None:
+    """Return the commit that the program is of, marked when it has been changed since."""
+    try:
+        here = Path(__file__).parent
+        ask = lambda *words: subprocess.run(
+            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
