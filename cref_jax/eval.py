@@ -16,19 +16,19 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cref_jax import (
-    cli,
-    commands,
-    evaluation,
-    evaluation_page,
-    ood_suite,
-    ood_verdict,
-    paper,
-    robustness,
-    table,
-)
+from cref_jax import cli, evaluation_page
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import (
+    command_suite,
+    crossing,
+    paper_results,
+    robustness_suite,
+    scene_results,
+    scene_suite,
+    tables,
+    walking,
+)
 from cref_jax.physics.records import EngineName
 from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.system import jax_setup, parallel
@@ -133,53 +133,52 @@ def _subject(source: Path, options: Options) -> Subject:
 
 def _count(options: Options) -> int:
     """Return the number of trials."""
-    return options.num_envs or (100 if jax.default_backend() == "cpu" else paper.TRIALS)
+    return options.num_envs or (100 if jax.default_backend() == "cpu" else paper_results.TRIALS)
 
 
 def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Judge in all cells of Table II."""
     console, count = Console(), _count(options)
-    console.print(f"{table.width(count * len(subjects))}\n{table.RULE}", highlight=False)
+    console.print(f"{tables.interval_note(count * len(subjects))}\n{tables.RULE}", highlight=False)
     judged = []
     with _progress(console, 12 * count * len(subjects)) as ended:
         for subject in subjects:
-            w = table.world(subject.policy.config, subject.world.physics)
-            judged.append(table.judge(w, subject.policy.train, count, options.seed, ended))
-    rows = table.cells(judged)
-    whole = table.overall(rows)
-    console.print(table.text(rows, whole))
+            w = tables.world(subject.policy.config, subject.world.physics)
+            judged.append(tables.run_cells(w, subject.policy.train, count, options.seed, ended))
+    rows = tables.cells(judged)
+    whole = tables.overall(rows)
+    console.print(tables.text(rows, whole))
     console.print("* beyond chance: 0 is not in the 95 % interval of the difference")
-    console.print(table.failures(rows), highlight=False)
-    return {"rule": table.RULE, "cells": rows, "overall": whole}
+    console.print(tables.failures(rows), highlight=False)
+    return {"rule": tables.RULE, "cells": rows, "overall": whole}
 
 
 def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Judge with everything randomised, and with each part alone."""
     console, count, policy = Console(), _count(options), subjects[0].policy
-    w = robustness.world(policy.config, subjects[0].world.physics)
-    with _progress(console, len(robustness.rows()) * count) as ended:
-        found = robustness.judge(w, policy.train, count, options.seed, ended)
-    console.print(robustness.text(found))
-    console.print(robustness.alone(found))
-    whole = [row for row in found if row["part"] == robustness.EVERYTHING]
-    parts = [row for row in found if row["part"] != robustness.EVERYTHING]
-    return {
-        "rule": table.RULE, "cells": whole, "overall": robustness.overall(found), "parts": parts,
-    }  # fmt: skip
+    w = robustness_suite.world(policy.config, subjects[0].world.physics)
+    with _progress(console, len(robustness_suite.rows()) * count) as ended:
+        found = robustness_suite.run_rows(w, policy.train, count, options.seed, ended)
+    console.print(robustness_suite.text(found))
+    console.print(robustness_suite.alone(found))
+    whole = [row for row in found if row["part"] == robustness_suite.EVERYTHING]
+    parts = [row for row in found if row["part"] != robustness_suite.EVERYTHING]
+    overall = robustness_suite.overall(found)
+    return {"rule": tables.RULE, "cells": whole, "overall": overall, "parts": parts}
 
 
 def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Judge in the scenes, through the numpy runtime."""
     with _exported(subjects[0]) as path:
-        verdict = ood_suite.judge(path, options.num_envs or 10, options.stress, options.seed)
-    ood_verdict.show(verdict, Console())
+        verdict = scene_suite.run_scenes(path, options.num_envs or 10, options.stress, options.seed)
+    scene_results.show(verdict, Console())
     return verdict.as_dict()
 
 
 def _film(subject: Subject, options: Options, out: Path) -> None:
     """Film the first trial in a scene."""
     with _exported(subject) as path:
-        trial = ood_suite.film(path, options.film or "", out, options.seed)
+        trial = scene_suite.film(path, options.film or "", out, options.seed)
     print(f"wrote {out}: {trial.ending} after {trial.seconds:.1f} s and {trial.progress:.1f} m")
 
 
@@ -198,7 +197,7 @@ def _exported(subject: Subject) -> Iterator[Path]:
 def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
     subject, count = subjects[0], _count(options)
     with _progress(Console(), count) as ended:
-        result = evaluation.cross(
+        result = crossing.cross(
             subject.policy.config, subject.world.physics, subject.policy.train, options.kind,
             options.size, count, options.seed, ended,
         )  # fmt: skip
@@ -208,7 +207,7 @@ def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
 
 def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
     subject = subjects[0]
-    result = evaluation.walk(
+    result = walking.walk(
         subject.policy.config, subject.world.physics, subject.policy.train, _count(options),
         options.seed,
     )  # fmt: skip
@@ -221,9 +220,11 @@ def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:
     policy, console = subjects[0].policy, Console()
     with console.status("13 commands, 10 s each"):
         physics = subjects[0].world.physics
-        found = commands.judge(policy.config, physics, policy.train, _count(options), options.seed)
-    console.print(commands.text(found))
-    console.print(commands.lines(found), highlight=False)
+        found = command_suite.run_commands(
+            policy.config, physics, policy.train, _count(options), options.seed
+        )
+    console.print(command_suite.text(found))
+    console.print(command_suite.lines(found), highlight=False)
     return found
 
 

@@ -20,8 +20,8 @@ from cref_jax import config, depth, geoms, robot
 from cref_jax.physics.records import Body
 from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
-from cref_jax.stand_in import Lane
 from cref_jax.terrain import Terrain
+from cref_jax.whole_body.ground import Lane
 
 CAMERAS = 256
 RAY_CAST = 16  # of the cameras, by MuJoCo's ray-cast, which is slow

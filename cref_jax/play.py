@@ -21,11 +21,12 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from rich.progress import track
 
-from cref_jax import cli, config, evaluation, film, network, panel, ppo, robot
+from cref_jax import cli, config, film, network, panel, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import footholds
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import protocol
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.system import jax_setup
@@ -242,7 +243,7 @@ def _world(options: Options, c: Config) -> World:
         c, terrain=dataclasses.replace(c.terrain, name=options.terrain or c.terrain.name)
     )
     atlas = _lane(c.terrain, options)
-    c = evaluation.evaluation_config(c, seconds=options.seconds + 1.0)  # it does not end by itself
+    c = protocol.evaluation_config(c, seconds=options.seconds + 1.0)  # it does not end by itself
     c = dataclasses.replace(
         c, command=dataclasses.replace(c.command, lane_vx=(options.command, options.command))
     )

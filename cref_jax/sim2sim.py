@@ -14,18 +14,22 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, deploy, evaluation, film, stand_in, transfer
+from cref_jax import cli, deploy, film
 from cref_jax.config import Config
-from cref_jax.disturbance import Disturbance
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
-from cref_jax.evaluation import TRIAL_SECONDS, Crossing
+from cref_jax.evaluation import crossing, sim2sim_table
+from cref_jax.evaluation.crossing import Crossing
+from cref_jax.evaluation.protocol import TRIAL_SECONDS
 from cref_jax.physics.simulation import Physics
 from cref_jax.policy import reader, sources
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene
-from cref_jax.stand_in import Lane, StandIn, Start, Trial
 from cref_jax.system import jax_setup, parallel
+from cref_jax.whole_body.disturbances import Disturbance
+from cref_jax.whole_body.ground import Lane
+from cref_jax.whole_body.simulator import WholeBodySim
+from cref_jax.whole_body.trial import Start, Trial, run_trial
 
 FRAME_RATE = 25.0  # 1/s, of a film
 SIZE = (960, 540)  # pixels of it
@@ -80,9 +84,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
     """Say what becomes of the trials on lanes of one kind, and return it."""
-    world = evaluation.crossing_world(policy.config, physics, options.kind, options.size)
-    trials = walked(world, path, options)
-    result = crossing(trials, options)
+    world = crossing.crossing_world(policy.config, physics, options.kind, options.size)
+    trials = run_trials(world, path, options)
+    result = summarize(trials, options)
     print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
     said = Counter(flag.name for trial in trials for flag in deploy.Status if flag & trial.status)
     if said:
@@ -100,36 +104,36 @@ def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) 
 
 def _table(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
     """Say what becomes of the trials on flat ground and in each cell, and return it."""
-    cells: list[transfer.Cell] = []
-    asked = transfer.lanes()
+    cells: list[sim2sim_table.Cell] = []
+    asked = sim2sim_table.lanes()
     for name, lanes in asked.items():
         print(f"cell {len(cells) + 1} of {len(asked)}, {name}", flush=True)
         ours, theirs = [], []
         for kind, size in lanes:
             count = max(1, options.trials // len(lanes))
             on = dataclasses.replace(options, kind=kind, size=size, trials=count)
-            world = evaluation.crossing_world(policy.config, physics, kind, size)
-            ours.append(crossing(walked(world, path, on), on))
+            world = crossing.crossing_world(policy.config, physics, kind, size)
+            ours.append(summarize(run_trials(world, path, on), on))
             theirs.append(in_training(policy, physics, on))
-        cells.append(transfer.Cell(name, tuple(theirs), tuple(ours)))
+        cells.append(sim2sim_table.Cell(name, tuple(theirs), tuple(ours)))
         print(cells[-1].line(), flush=True)
-    Console().print(transfer.text(cells))
+    Console().print(sim2sim_table.text(cells))
     asdict = lambda crossings: [c._asdict() for c in crossings]
     return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
 
 
 def in_training(policy: TrainedPolicy, physics: Physics, options: Options) -> Crossing:
     """Return what becomes of the same trials in the training simulation."""
-    return evaluation.cross(
+    return crossing.cross(
         policy.config, physics, policy.train, options.kind, options.size, options.trials,
         options.seed,
     )  # fmt: skip
 
 
-def walked(world: World, path: Path, options: Options) -> list[Trial]:
+def run_trials(world: World, path: Path, options: Options) -> list[Trial]:
     """Return the trials of the policy there, on all cores."""
     lanes = [lane_of(world, level) for level in range(world.lanes.levels)]
-    _, levels = evaluation.crossing_lanes(options.trials)
+    _, levels = crossing.crossing_lanes(options.trials)
     jobs = list(zip(starts(world, options.seed, options.trials), levels.tolist(), strict=True))
     return parallel.run(_Walker, (world.config, path, lanes, options.latency), jobs)
 
@@ -140,14 +144,14 @@ class _Walker:
     def __init__(self, c: Config, path: Path, lanes: list[Lane], latency: float) -> None:
         self._contents = deploy.contents(path)
         joints = deploy.Policy(*self._contents).joints.names
-        self._bodies = [StandIn(c, lane, joints) for lane in lanes]
+        self._bodies = [WholeBodySim(c, lane, joints) for lane in lanes]
         late = max(0, round(latency / c.physics.control_period))
         self._disturbance = Disturbance(latency=late)
 
     def __call__(self, job: tuple[Start, int]) -> Trial:
         start, level = job
         policy = deploy.Policy(*self._contents)
-        return stand_in.run(self._bodies[level], policy, start, TRIAL_SECONDS, self._disturbance)
+        return run_trial(self._bodies[level], policy, start, TRIAL_SECONDS, self._disturbance)
 
 
 def lane_of(world: World, level: int = 0) -> Lane:
@@ -159,14 +163,14 @@ def lane_of(world: World, level: int = 0) -> Lane:
 
 def starts(world: World, seed: int, count: int) -> list[Start]:
     """Return poses and commands of the trials of this seed, as data."""
-    state = evaluation.starts(world, seed, count).env
+    state = crossing.first_robots(world, seed, count).env
     qpos, speeds = np.asarray(state.body.qpos), np.asarray(state.command[:, 0])
     driven = slice(7, 7 + len(world.physics.robot.joint_names))
     return [Start(x[:7], x[driven], float(v)) for x, v in zip(qpos, speeds, strict=True)]
 
 
-def crossing(trials: list[Trial], options: Options) -> Crossing:
-    """Return how many came to the end."""
+def summarize(trials: list[Trial], options: Options) -> Crossing:
+    """Count how many trials came to the end, and how the others ended."""
     causes = Counter(trial.ending for trial in trials)
     seconds = [trial.seconds for trial in trials if trial.ending == "finished"]
     return Crossing(

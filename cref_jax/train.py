@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import tyro
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cref_jax import cli, evaluation
+from cref_jax import cli
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World, build_physics, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import walking
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.policy import learner_file, sources, trained, warm_start
@@ -218,7 +219,7 @@ def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) 
     if options.evaluate:
         physics = build_physics(c, options.engine)
         one = jax.device_put(trained.with_averaged_actor(state.train), jax.devices()[0])
-        result = evaluation.walk(c, physics, one)
+        result = walking.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')
 

@@ -37,13 +37,14 @@ from jaxtyping import Array, Bool, Float, Float16, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from cref_jax import cli, gaze, watch
+from cref_jax import cli
 from cref_jax.config import Config
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import attention, recorder
+from cref_jax.evaluation.recorder import Moment, Watched
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section
-from cref_jax.watch import Moment, Watched
 
 EDGE = (
     0.03  # m off the plane of the neighbours; assumed: above rounding and the slope's 2 cm columns
@@ -60,7 +61,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Options(watch.Options):
+class Options(recorder.Options):
     """Draw what the attention of a policy looks at, and count it."""
 
     run: Path | None = None
@@ -116,25 +117,25 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(options.debug):
         jax_setup.prepare()
         out = cli.writable(options.out, ".png")
-        policy, world = watch.opened(options.run, options.policy, options.engine)
+        policy, world = recorder.open_policy(options.run, options.policy, options.engine)
         c = policy.config
         check(c)
-        kind = watch.kind_of_lane(c, options.kind)
-        world = watch.placed(c, world, watch.medium(c), options.command)
-        count = watch.crowd(options.num_envs, on_accelerator=512)
-        robots = watch.begin(world, options.seed, count)
-        kinds, _ = watch.in_turn(world.lanes, count)
+        kind = recorder.kind_of_lane(c, options.kind)
+        world = recorder.place_robots(c, world, recorder.medium_lanes(c), options.command)
+        count = recorder.default_num_envs(options.num_envs, on_accelerator=512)
+        robots = recorder.begin(world, options.seed, count)
+        kinds, _ = recorder.round_robin_lanes(world.lanes, count)
         followed = np.flatnonzero(kinds == world.lanes.kinds.index(kind))[:FOLLOWED]
         if not followed.size:
             raise ConfigError(f"--num-envs must be at least {len(world.lanes.kinds)}: one a lane")
-        steps = watch.steps_of(options.seconds, c)
+        steps = recorder.steps_of(options.seconds, c)
         seeing = functools.partial(look, tuple(followed))
-        watched = watch.watch(world, policy.train, robots, steps, seeing)
+        watched = recorder.watch(world, policy.train, robots, steps, seeing)
         frames = attended(watched)
-        terrain = watch.terrain_under(world.lanes, watched.seen.base_x, AHEAD)
+        terrain = recorder.terrain_under(world.lanes, watched.seen.base_x, AHEAD)
         of_frame = terrain[frames.step, frames.robot]
-        found = list(rows(frames, of_frame, gaze.ahead(world), gaze.grid(c)))
-        watch.write_table(out.with_suffix(".csv"), COLUMNS, found)
+        found = list(rows(frames, of_frame, attention.ahead(world), attention.grid(c)))
+        recorder.write_table(out.with_suffix(".csv"), COLUMNS, found)
         for row in found:
             if row.where in TARGETS:
                 print(line(row))
@@ -162,15 +163,15 @@ def look(followed: tuple[int, ...], world: World, moment: Moment) -> Step:
     """Return the frame that is exposed, what is in it, and the attention to the one before."""
     state, feed = moment.robots.env, moment.after.feed
     images = feed.images(world.config.network)
-    shape = gaze.grid(world.config)
+    shape = attention.grid(world.config)
 
     def targets() -> tuple[Bool[Array, "E N"], Bool[Array, "E N"]]:
         camera = world.config.camera
         metres = (images.astype(jnp.float32) + 0.5) * camera.d_max
-        ground = jax.vmap(lambda s: gaze.ground_alone(world, s))(state)
-        own = metres < ground - gaze.LINK
-        edge = gaze.is_edge(ground, camera) & ~own
-        return gaze.in_tokens(edge, shape), gaze.in_tokens(own, shape)
+        ground = jax.vmap(lambda s: attention.ground_alone(world, s))(state)
+        own = metres < ground - attention.LINK
+        edge = attention.is_edge(ground, camera) & ~own
+        return attention.in_tokens(edge, shape), attention.in_tokens(own, shape)
 
     none = jnp.zeros((state.step.size, shape[0] * shape[1]), bool)
     edge, own = jax.lax.cond(feed.fresh, targets, lambda: (none, none))
@@ -209,8 +210,8 @@ def rows(
             counts = tokens[there].any(axis=1) & ~tokens[there].all(axis=1)
             n, chosen = int(counts.sum()), tokens[there][counts]
             if n:
-                share, got = gaze.shares(mean[there][counts], chosen)
-                _, still = gaze.shares(np.broadcast_to(fixed, chosen.shape), chosen)
+                share, got = attention.shares(mean[there][counts], chosen)
+                _, still = attention.shares(np.broadcast_to(fixed, chosen.shape), chosen)
                 yield Row(name, where, n, share, got, got / share, still / share)
         by_row = fixed.reshape(shape).sum(axis=1)
         for k, got in enumerate(by_row):
@@ -238,16 +239,16 @@ def strip(
 ) -> None:
     """Draw depth and attention of the followed robot that came furthest, at each of MOMENTS."""
     c, seen, k = world.config, watched.seen, world.lanes.kinds.index(kind)
-    grid = gaze.grid(c)
+    grid = attention.grid(c)
     far = np.where(watched.alive, seen.base_x, -np.inf)[:, followed].max(axis=0)
     place = int(np.argmax(far))
     mine = np.flatnonzero(frames.robot == followed[place])
-    _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
+    _, levels = recorder.round_robin_lanes(world.lanes, watched.alive.shape[1])
     steps = cross_section.edges(cross_section.of_lane(world.lanes.tile(levels[followed[place]], k)))
     edge = float(steps[0]) if steps.size else 2.0
     heads = frames.attention.shape[1]
     axes = figure.subplots(2 + heads, len(MOMENTS), squeeze=False)
-    lane = watch.name_of_lane(world, kind)
+    lane = recorder.name_of_lane(world, kind)
     figure.suptitle(
         f"one robot on {lane}; x: from the lane's first edge to its pelvis\n"
         "orange: attention, each map up to its own largest; blue dots: tokens with a ground edge",
@@ -265,7 +266,7 @@ def strip(
         weights = frames.attention[at]
         for row, given in enumerate([weights.mean(axis=0), *weights], start=1):
             edges = frames.targets["ground edge"][at].reshape(grid)
-            overlay(axes[row, column], image, gaze.upsampled(given, grid, image.shape), edges)
+            overlay(axes[row, column], image, attention.upsampled(given, grid, image.shape), edges)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
     names = [
@@ -298,7 +299,7 @@ def maps_and_bars(
 ) -> None:
     """Draw the mean attention on each terrain, and how much of it is on edges and links."""
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.0))
-    shape, distances = gaze.grid(world.config), gaze.ahead(world)
+    shape, distances = attention.grid(world.config), attention.ahead(world)
     mean = frames.attention.mean(axis=1)
     axes = above.subplots(2, 4)
     above.suptitle("mean attention by terrain", fontsize=10)

@@ -11,8 +11,10 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import deploy, ood, ood_suite
+from cref_jax import deploy
+from cref_jax.evaluation import scene_suite
 from cref_jax.policy import sources
+from cref_jax.whole_body import scene_files
 
 # isort: split
 
@@ -38,14 +40,14 @@ class Options:
 def main() -> None:
     """Print how many trials come to the end, by scene and window."""
     options = tyro.cli(Options)
-    scenes = {path.stem: ood.load(path) for path in sorted(SCENES.glob("*.toml"))}
+    scenes = {path.stem: scene_files.load(path) for path in sorted(SCENES.glob("*.toml"))}
     print("| window | " + " | ".join(scene.title for scene in scenes.values()) + " | all |")
     for window in options.windows:
         with tempfile.TemporaryDirectory() as folder:
             path = with_window(
                 options.policy or sources.bundled_policy(), window, Path(folder) / "policy"
             )
-            found = ood_suite.judge(path, options.trials, 0, options.seed, scenes=scenes)
+            found = scene_suite.run_scenes(path, options.trials, 0, options.seed, scenes=scenes)
         counts = [scene.successes for scene in found.scenes]
         total = f"{sum(counts)} of {len(counts) * options.trials}"
         print(

@@ -41,15 +41,16 @@ import tyro
 from jaxtyping import Array, Bool, Float
 from matplotlib.axes import Axes
 
-from cref_jax import cli, evaluation, terrain, watch
+from cref_jax import cli, terrain
 from cref_jax.env import footholds
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import protocol, recorder
+from cref_jax.evaluation.recorder import Moment, Watched
 from cref_jax.policy import sources
 from cref_jax.robot import kinematics
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section, lanes
-from cref_jax.watch import Moment, Watched
 
 KINDS = ("ascent", "descent")  # of lane, one flight each
 TREAD = 0.30  # m, terrains/flight.toml
@@ -65,7 +66,7 @@ COLUMNS = ("policy", "way", "robot", "foot", "time_s", "position_cm", "d_xz_cm")
 
 
 @dataclass(frozen=True)
-class Options(watch.Options):
+class Options(recorder.Options):
     """Compare where policies put their feet on stairs."""
 
     policies: Annotated[tuple[str, ...], tyro.conf.arg(metavar="LABEL=PATH ...")] = ()
@@ -146,7 +147,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"{label}, ascent: {ways[cross_section.UP].collisions()}")
             if not any(len(ways[way].position) for way in WAYS):
                 print(f"{label}: no touchdown on these stairs, so nothing to draw")
-        watch.write_table(out.with_suffix(".csv"), COLUMNS, rows(found))
+        recorder.write_table(out.with_suffix(".csv"), COLUMNS, rows(found))
         draw(out, found, options)
         print(f"wrote {out} and {out.with_suffix('.csv')}")
 
@@ -171,13 +172,13 @@ def named(options: Options) -> dict[str, Path]:
 
 def measured(path: Path, options: Options) -> dict[int, Way]:
     """Return what one policy does on the flights up and on those down."""
-    policy, world = watch.opened(None, path, options.engine)
+    policy, world = recorder.open_policy(None, path, options.engine)
     sizes = {kind: (options.rise,) for kind in KINDS}
-    stairs = lanes.grid(policy.config.terrain, sizes, evaluation.LANE_SEEDS)
-    world = watch.placed(policy.config, world, stairs, options.command)
-    robots = watch.begin(world, options.seed, watch.crowd(options.num_envs, 2048))
-    steps = watch.steps_of(options.seconds, policy.config)
-    watched = watch.watch(world, policy.train, robots, steps, look)
+    stairs = lanes.grid(policy.config.terrain, sizes, protocol.LANE_SEEDS)
+    world = recorder.place_robots(policy.config, world, stairs, options.command)
+    robots = recorder.begin(world, options.seed, recorder.default_num_envs(options.num_envs, 2048))
+    steps = recorder.steps_of(options.seconds, policy.config)
+    watched = recorder.watch(world, policy.train, robots, steps, look)
     return summed(world, watched)
 
 
@@ -218,7 +219,7 @@ def summed(world: World, watched: Watched) -> dict[int, Way]:
     t, robot, foot = np.nonzero(seen.touchdown & alive[..., None] & (seen.air_time >= AIR))
     sole = seen.sole[t, robot, foot]
     flight, position = np.zeros(len(t), int), np.zeros(len(t))
-    lane, levels = watch.in_turn(world.lanes, alive.shape[1])
+    lane, levels = recorder.round_robin_lanes(world.lanes, alive.shape[1])
     onto, over = np.zeros_like(alive), np.zeros_like(alive)
     for e, (kind, level) in enumerate(zip(lane, levels, strict=True)):
         stairs, mine = cross_section.of_lane(world.lanes.tile(level, kind)), robot == e
@@ -228,7 +229,7 @@ def summed(world: World, watched: Watched) -> dict[int, Way]:
         onto[:, e] = alive[:, e] & (x > stairs.left[treads[0]])
         over[:, e] = alive[:, e] & (x > stairs.right[treads[-1]])
     foot_hits, shank_hits = (
-        watch.onsets(flag & alive[..., None]) for flag in (seen.foot_riser, seen.shank_riser)
+        recorder.onsets(flag & alive[..., None]) for flag in (seen.foot_riser, seen.shank_riser)
     )
     ways = {}
     for kind, way in enumerate(WAYS):

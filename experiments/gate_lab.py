@@ -30,13 +30,14 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from matplotlib.axes import Axes
 
-from cref_jax import cli, watch
+from cref_jax import cli
 from cref_jax.config import Config
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import recorder
+from cref_jax.evaluation.recorder import Moment, Watched
 from cref_jax.system import jax_setup
 from cref_jax.terrain import Terrain, cross_section
-from cref_jax.watch import Moment, Watched
 
 RISKY = 0.20  # rad, |roll| or |pitch| above it, Sec. III-B
 WARM_UP = 1.0  # s; assumed: the memory is empty at first and the robot stands
@@ -50,7 +51,7 @@ COLUMNS = ("group", "state", "n", "robots", "mean", "q25", "median", "q75", "not
 
 
 @dataclass(frozen=True)
-class Options(watch.Options):
+class Options(recorder.Options):
     """Group the highway gate of a policy by terrain, contact phase and posture."""
 
     run: Path | None = None
@@ -97,17 +98,17 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(options.debug):
         jax_setup.prepare()
         out = cli.writable(options.out, ".png")
-        policy, world = watch.opened(options.run, options.policy, options.engine)
+        policy, world = recorder.open_policy(options.run, options.policy, options.engine)
         c = policy.config
         check(c)
-        kind = watch.kind_of_lane(c, options.kind)
-        world = watch.placed(c, world, watch.medium(c), options.command)
-        count = watch.crowd(options.num_envs, on_accelerator=4096)
-        robots = watch.begin(world, options.seed, count)
-        steps = watch.steps_of(options.seconds, c)
-        watched = watch.watch(world, policy.train, robots, steps, look)
+        kind = recorder.kind_of_lane(c, options.kind)
+        world = recorder.place_robots(c, world, recorder.medium_lanes(c), options.command)
+        count = recorder.default_num_envs(options.num_envs, on_accelerator=4096)
+        robots = recorder.begin(world, options.seed, count)
+        steps = recorder.steps_of(options.seconds, c)
+        watched = recorder.watch(world, policy.train, robots, steps, look)
         found = list(rows(world, watched))
-        watch.write_table(
+        recorder.write_table(
             out.with_suffix(".csv"), COLUMNS, ((*row, row.note) for row in found if row.n)
         )
         draw(out, found, world, watched, kind)
@@ -145,7 +146,7 @@ def rows(world: World, watched: Watched) -> Iterator[Row]:
     counted = watched.alive.copy()
     counted[: round(WARM_UP / world.config.physics.control_period)] = False
     states = {
-        "terrain": watch.terrain_under(world.lanes, seen.pose[..., 0]),
+        "terrain": recorder.terrain_under(world.lanes, seen.pose[..., 0]),
         "phase": phases(seen.airborne),
         "posture": postures(seen.pose[..., 3:]),
     }
@@ -199,7 +200,7 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
         time = t * world.config.physics.control_period
         draw_gate(gate, time, watched.seen.gate[t, best])
         draw_feet(feet, time, ~watched.seen.airborne[t, best])
-        _, levels = watch.in_turn(world.lanes, watched.alive.shape[1])
+        _, levels = recorder.round_robin_lanes(world.lanes, watched.alive.shape[1])
         lane = world.lanes.tile(levels[best], k)
         under = draw_ground(ground, time, lane, watched.seen.pose[t, best, 0])
         for at in time[1:][np.diff(under) != 0.0]:
@@ -207,7 +208,7 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
         for axis in (gate, feet):
             axis.tick_params(labelbottom=False)
         gate.set_title(
-            f"{watch.name_of_lane(world, kind)}: the robot that came furthest", fontsize=9
+            f"{recorder.name_of_lane(world, kind)}: the robot that came furthest", fontsize=9
         )
     else:
         gate.set_title(f"no robot on {kind}", fontsize=9)
@@ -217,7 +218,7 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
 def furthest(world: World, watched: Watched, kind: int) -> tuple[Int[np.ndarray, " t"], int]:
     """Return the steps and the number of the robot that came furthest on a lane."""
     x = np.where(watched.alive, watched.seen.pose[..., 0], -np.inf)
-    x[:, watch.in_turn(world.lanes, x.shape[1])[0] != kind] = -np.inf
+    x[:, recorder.round_robin_lanes(world.lanes, x.shape[1])[0] != kind] = -np.inf
     best = int(np.argmax(x.max(axis=0)))
     return np.flatnonzero(np.isfinite(x[:, best])), best
 

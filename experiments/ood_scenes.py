@@ -7,10 +7,11 @@ depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import config, film, ood, robot, stand_in
+from cref_jax import config, film, robot
 from cref_jax.config import Config
 from cref_jax.rendering import robot_scene
-from cref_jax.stand_in import StandIn
+from cref_jax.whole_body import ground, scene_files
+from cref_jax.whole_body.simulator import WholeBodySim
 
 # isort: split
 
@@ -59,18 +60,18 @@ class Options:
 def main() -> None:
     """Draw all scenes on one sheet."""
     options = tyro.cli(Options)
-    c, found = Config(), ood.scenes()
+    c, found = Config(), scene_files.scenes()
     rows = -(-len(found) // COLUMNS)
     figure = plt.figure(figsize=(4.9 * COLUMNS, 2.15 * rows + 0.8))
     sheet, foot = figure.subfigures(2, 1, height_ratios=[2.15 * rows, 0.8])
     cells = sheet.subfigures(rows, COLUMNS)
-    for cell, (name, ground) in zip(cells.flat, found.items(), strict=False):
-        picture, seen = view(c, ground, PLACES.get(name, 1.3))
+    for cell, (name, scene) in zip(cells.flat, found.items(), strict=False):
+        picture, seen = view(c, scene, PLACES.get(name, 1.3))
         left, right = cell.subplots(1, 2)
         cell.subplots_adjust(left=0.02, right=0.98, bottom=0.14, top=0.99, wspace=0.03)
         left.imshow(picture)
         depth = right.imshow(seen, cmap="viridis_r", vmin=NEAR, vmax=c.camera.d_max)
-        left.set_title(ground.title, y=-0.155, fontsize=12, loc="left")
+        left.set_title(scene.title, y=-0.155, fontsize=12, loc="left")
         for axis in (left, right):
             axis.set_axis_off()
     bar = figure.colorbar(
@@ -81,9 +82,9 @@ def main() -> None:
     print(f"wrote {options.out}")
 
 
-def view(c: Config, ground: ood.Scene, x: float) -> tuple[film.Frame, np.ndarray]:
+def view(c: Config, ground: scene_files.Scene, x: float) -> tuple[film.Frame, np.ndarray]:
     """Return a picture of the robot at x and its depth image, m, d_max where nothing is seen."""
-    body = StandIn(c, ground, robot.load(config.Robot(actuated="all")).joint_names)
+    body = WholeBodySim(c, ground, robot.load(config.Robot(actuated="all")).joint_names)
     state = mujoco.MjData(body.model)
     state.qpos[:7] = [x, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0]
     state.qpos[7:] = body.robot.nominal_pose
@@ -91,17 +92,17 @@ def view(c: Config, ground: ood.Scene, x: float) -> tuple[film.Frame, np.ndarray
     state.qpos[2] = body.robot.standing_height + under_soles(body, state) + 0.002
     mujoco.mj_forward(body.model, state)
     seen = body.image(state)
-    spec = robot_scene.stage("all", c.physics, -ood.DITCH - robot_scene.BASE)
+    spec = robot_scene.stage("all", c.physics, -scene_files.DITCH - robot_scene.BASE)
     ground.add_to(spec, robot.FRICTION)
     with robot_scene.Canvas(spec.compile(), *SIZE, *VIEWS.get(ground.name, VIEW)) as canvas:
         picture = canvas.draw(state.qpos, state.qpos[:3] + AHEAD)
     return picture, np.where(np.isfinite(seen), np.minimum(seen, c.camera.d_max), c.camera.d_max)
 
 
-def under_soles(body: StandIn, state: mujoco.MjData) -> float:
+def under_soles(body: WholeBodySim, state: mujoco.MjData) -> float:
     """Return the height of what is under the soles, m."""
     found, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
-    groups = np.array([g == stand_in.GROUND for g in range(6)], np.uint8)
+    groups = np.array([g == ground.GROUND for g in range(6)], np.uint8)
     spheres, heights = body.robot.spheres, []
     for link, position in zip(spheres.body, spheres.position, strict=True):
         if link in body.feet:

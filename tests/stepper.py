@@ -13,7 +13,7 @@ import numpy as np
 
 from cref_jax import config, robot
 from cref_jax.config import Config
-from cref_jax.stand_in import StandIn
+from cref_jax.whole_body.simulator import WholeBodySim
 
 X2 = robot.load(config.Robot(actuated="all"))
 START = 0.75  # m
@@ -198,7 +198,7 @@ def feet_on(ground) -> mujoco.MjModel:
 
 def lead(ground, steps: list[Foothold]) -> None:
     """Lead the upper body over the feet."""
-    body = StandIn(Config(), ground, X2.joint_names)
+    body = WholeBodySim(Config(), ground, X2.joint_names)
     state = mujoco.MjData(body.model)
     state.qpos[3], state.qpos[7:] = 1.0, X2.nominal_pose
     links = [body.model.body(b).name for b in body.model.geom_bodyid]

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from cref_jax import disturbance
-from cref_jax.disturbance import Channel, Disturbance
+from cref_jax.whole_body import disturbances
+from cref_jax.whole_body.disturbances import Channel, Disturbance
 
 SHAPE = (48, 64)
 FRAME = np.full(SHAPE, 2.0, np.float32)
@@ -66,7 +66,7 @@ def test_blind_pixels_read_zero_or_nothing():
 @pytest.mark.parametrize("count", [1, 3])
 def test_regions_are_large_pieces(count):
     for seed in range(20):
-        which = disturbance.regions(SHAPE, 0.4, count, np.random.default_rng(seed))
+        which = disturbances.regions(SHAPE, 0.4, count, np.random.default_rng(seed))
         assert ndimage.label(which >= 0, np.ones((3, 3)))[1] <= count
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from cref_jax import eval, ood_suite, paper, table
+from cref_jax import eval
 from cref_jax.eval import Options
+from cref_jax.evaluation import paper_results, scene_suite, tables
 from cref_jax.policy import reader, sources
 
 
@@ -62,9 +63,9 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
 
     def judge(path, trials, stress, seed):
         asked.append((Path(path), trials, stress, seed))
-        return ood_suite.ood_verdict.verdict({}, {ood_suite.GOOD: {}})
+        return scene_suite.ood_verdict.verdict({}, {scene_suite.GOOD: {}})
 
-    monkeypatch.setattr(ood_suite, "judge", judge)
+    monkeypatch.setattr(scene_suite, "run_scenes", judge)
     bundled = sources.bundled_policy()
     arguments = ["--suite", "ood", "--policy", str(bundled), "--num-envs", "3", "--seed", "5"]
     eval.main([*arguments, "--out", str(tmp_path)])
@@ -76,13 +77,15 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(table.evaluation, "block", lambda: 2)
-    monkeypatch.setattr(table.evaluation, "TRIAL_SECONDS", 1.0)
+    monkeypatch.setattr(tables.evaluation, "block", lambda: 2)
+    monkeypatch.setattr(tables.evaluation, "TRIAL_SECONDS", 1.0)
     bundled = str(sources.bundled_policy())
     eval.main(["--policy", bundled, bundled, "--num-envs", "2", "--out", str(tmp_path)])
     record = json.loads((tmp_path / "eval.json").read_text())
     cells = {(row["kind"], row["level"]): row for row in record["cells"]}
-    assert list(cells) == [(kind, level) for kind in paper.KINDS for level in paper.LEVELS]
+    assert list(cells) == [
+        (kind, level) for kind in paper_results.KINDS for level in paper_results.LEVELS
+    ]
     fields = {
         "kind", "level", "size_m", "trials", "successes", "rate", "wilson_low", "wilson_high",
         "up_failures", "down_failures", "failures", "by_speed",

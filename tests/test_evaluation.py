@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from cref_jax import evaluation
 from cref_jax.config import Config, override
 from cref_jax.env.state import Ending
-from cref_jax.evaluation import _judged, _Step
+from cref_jax.evaluation import crossing, protocol, walking
+from cref_jax.evaluation.walking import _Step, _summarize
 
 
 def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _Step:
@@ -28,7 +28,7 @@ def ending(episodes: int, **flags: list[bool]) -> Ending:
 def test_two_of_three_robots_that_fall_are_counted_by_cause():
     alive = np.ones((4, 3), bool)
     end = ending(3, tilted=[True, False, False], low=[False, True, False])
-    walk = _judged(end, trace(alive, 0.1, np.zeros((4, 3, 2), bool)), Config())
+    walk = _summarize(end, trace(alive, 0.1, np.zeros((4, 3, 2), bool)), Config())
     assert (walk.episodes, walk.fell) == (3, 2)
     assert walk.by_cause == {"unstable": 0, "tilted": 1, "low": 1, "hit": 0, "dropped": 0}
 
@@ -37,7 +37,7 @@ def test_a_robot_with_two_causes_counts_once():
     end = ending(
         3, tilted=[True, False, False], low=[True, True, False], finished=[False, False, True]
     )
-    causes = evaluation._by_cause(end)
+    causes = walking._by_cause(end)
     assert causes == {"unstable": 0, "tilted": 1, "low": 1, "hit": 0, "dropped": 0}
 
 
@@ -46,7 +46,7 @@ def test_what_comes_after_a_fall_does_not_count():
     alive = np.array([[1, 1], [1, 1], [0, 1], [0, 1]], bool)
     seen = trace(alive, 0.0, np.zeros((4, 2, 2), bool))
     error = np.array([[0.2, 0.4], [0.2, 0.4], [9.0, 0.4], [9.0, 0.4]], np.float32)
-    walk = _judged(ending(2), seen._replace(forward_error=error), Config())
+    walk = _summarize(ending(2), seen._replace(forward_error=error), Config())
     assert walk.speed_error == pytest.approx(0.3)  # (0.2 + 0.4) / 2
     # 10 cm aside a step: 0.1 and 0.3 m until their ends
     assert walk.sideways == pytest.approx({"drift_m": 0.2, "largest_m": 0.2, "worst_m": 0.3})
@@ -56,7 +56,7 @@ def test_speed_that_errs_both_ways_alike_is_right_on_the_whole():
     alive = np.ones((4, 1), bool)
     seen = trace(alive, 0.0, np.zeros((4, 1, 2), bool))
     error = np.array([[0.2], [-0.2], [0.2], [-0.2]], np.float32)
-    walk = _judged(ending(1), seen._replace(forward_error=error), Config())
+    walk = _summarize(ending(1), seen._replace(forward_error=error), Config())
     assert walk.speed_error == pytest.approx(0.0, abs=1e-6)
 
 
@@ -64,7 +64,7 @@ def test_share_in_the_air_and_length_of_a_stride():
     # left foot: 10 steps up, 10 down, over 40 steps of 20 ms: half the time, a stride of 0.4 s
     up = np.tile(np.repeat([True, False], 10), 2)
     airborne = np.stack([up, ~up], axis=-1)[:, None]  # the right foot alternates with it
-    walk = _judged(ending(1), trace(np.ones((40, 1), bool), 0.0, airborne), Config())
+    walk = _summarize(ending(1), trace(np.ones((40, 1), bool), 0.0, airborne), Config())
     assert walk.airborne == (0.5, 0.5)
     # touchdowns seen: left at 10 and 30, right at 20; 40 steps x 2 feet x 0.02 s / 3 = 0.533 s
     assert walk.step_seconds == pytest.approx(1.6 / 3)
@@ -74,12 +74,12 @@ def test_every_trial_begins_at_the_start_of_its_lane_and_goes_along_it():
     trained = override(
         Config(), {"episode": {"start_anywhere": 0.3}, "command": {"lane_free": 0.2}}
     )
-    c = evaluation.trial_config(trained)
+    c = protocol.trial_config(trained)
     assert (c.episode.start_anywhere, c.command.lane_free) == (0.0, 0.0)
 
 
 def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
-    c = evaluation.evaluation_config(Config())
+    c = protocol.evaluation_config(Config())
     assert not c.randomisation.enabled and not c.curriculum.enabled
     assert c.command.lane_vx == (0.4, 0.8) and c.command.open_kinds == ()
 
@@ -89,6 +89,6 @@ def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
     [("gap", 0.305, "gap 30.5 cm: 9 of"), ("slope", 0.35, "slope 35 %: 9")],
 )
 def test_a_size_is_said_in_its_unit(kind, size, begin):
-    outcome = evaluation.Crossing(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
+    outcome = crossing.Crossing(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
     assert outcome.line().startswith(begin)
     assert outcome.line().endswith("failures: 1 low")

@@ -15,14 +15,15 @@ from jaxtyping import Array, Bool, Int
 from PIL import Image
 from random_policy import ROBOT, SMALL, policy
 
-from cref_jax import cli, config, gaze, watch
+from cref_jax import cli, config
 from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import attention, recorder
+from cref_jax.evaluation.recorder import Moment, Watched
 from cref_jax.policy import writer
 from cref_jax.terrain import atlas, cross_section, lanes
 from cref_jax.terrain.cross_section import DOWN, UP
-from cref_jax.watch import Moment, Watched
 
 CELL = 0.1  # m
 
@@ -108,14 +109,14 @@ def test_the_stairs_have_the_tread_that_is_drawn():
 
 def test_robots_stand_on_all_lanes_in_turn():
     atlas = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.3,)}, [1, 2])
-    kinds, levels = watch.in_turn(atlas, 6)
+    kinds, levels = recorder.round_robin_lanes(atlas, 6)
     assert list(zip(kinds, levels, strict=True)) == [
         (0, 0), (1, 0), (0, 1), (1, 1), (0, 0), (1, 0)
     ]  # fmt: skip
 
 
 def test_medium_lanes_have_the_medium_sizes_of_table_2():
-    atlas = watch.medium(Config())
+    atlas = recorder.medium_lanes(Config())
     sizes = dict(zip(atlas.kinds, np.asarray(atlas.sizes[0]), strict=True))
     assert (sizes["stairs_up"], sizes["gap"], sizes["platform"]) == (0.15, 0.50, 0.30)
     # Table II has no slope and no rough ground: the middle of 0 to 0.35 and of 0 to 0.06
@@ -127,7 +128,7 @@ def test_what_a_robot_walks_on():
     both = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.5,)}, [1])
     edge = 0.02 * np.argmax(cross_section.middle_heights(both.tile(0, 1)) < 0)
     x = np.array([[1.0, edge - 0.6], [5.0, edge - 0.4], [9.0, edge + 0.2]])
-    names = watch.terrain_under(both, x).tolist()
+    names = recorder.terrain_under(both, x).tolist()
     assert names == [["flat", ""], ["flat", "gap"], ["flat", "gap"]]
 
 
@@ -191,7 +192,7 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
 def test_toes_touch_a_riser_once_they_are_at_it(world):
     world = world.replace(lanes=flights(0.20))
     p = cross_section.of_lane(world.lanes.tile(0, 0))
-    state = jax.tree.map(lambda a: a[0], watch.begin(world, 0, 1).env)
+    state = jax.tree.map(lambda a: a[0], recorder.begin(world, 0, 1).env)
     links = world.physics.links(state.body)
     balls = ROBOT.spheres
     x = foothold_lab.kinematics.points(links, balls.body, balls.position)[:, 0]
@@ -241,15 +242,15 @@ def test_the_gate_of_a_state_worked_by_hand():
 def test_uniform_attention_is_not_enriched_and_concentrated_attention_is_by_all_over_some():
     tokens = np.zeros((2, 48), bool)
     tokens[:, :6] = True  # n = 6 of N = 48
-    share, got = gaze.shares(np.full((2, 48), 1 / 48), tokens)
+    share, got = attention.shares(np.full((2, 48), 1 / 48), tokens)
     assert (share, got) == pytest.approx((6 / 48, 6 / 48))
-    share, got = gaze.shares(tokens / 6.0, tokens)
+    share, got = attention.shares(tokens / 6.0, tokens)
     assert got / share == pytest.approx(48 / 6)
 
 
 def test_upsampling_keeps_the_mass_where_it_was():
     weights = np.arange(48.0) / np.arange(48.0).sum()
-    image = gaze.upsampled(weights, (6, 8), (48, 64))
+    image = attention.upsampled(weights, (6, 8), (48, 64))
     assert image.shape == (48, 64) and image.sum() == pytest.approx(1.0)
     assert image[8:16, 16:24].sum() == pytest.approx(weights[8 + 2])  # row 1, column 2
 
@@ -262,10 +263,10 @@ def plane(slope: float, offset: float) -> np.ndarray:
 
 def test_a_plane_has_no_edge_even_where_it_leaves_the_range():
     c = Config().camera
-    assert not gaze.is_edge(jnp.asarray(plane(0.01, 0.5)), c).any()
+    assert not attention.is_edge(jnp.asarray(plane(0.01, 0.5)), c).any()
     leaves = plane(0.02, 0.1)  # beyond 3 m in the upper rows
     assert leaves.max() > c.d_max
-    assert not gaze.is_edge(jnp.minimum(leaves, c.d_max), c).any()
+    assert not attention.is_edge(jnp.minimum(leaves, c.d_max), c).any()
 
 
 @pytest.mark.parametrize(("jump", "edge"), [(0.02, False), (0.10, True), (9.0, True)])
@@ -273,15 +274,15 @@ def test_a_jump_of_the_ground_is_an_edge_in_its_two_rows(jump, edge):
     c = Config().camera
     metres = plane(0.01, 0.5)
     metres[:20] += jump  # the upper rows lie further away, or beyond the range
-    found = np.asarray(gaze.is_edge(jnp.minimum(metres, c.d_max), c))
+    found = np.asarray(attention.is_edge(jnp.minimum(metres, c.d_max), c))
     rows = np.flatnonzero(found.any(axis=1)).tolist()
     assert set(rows) <= {19, 20} and bool(rows) == edge
-    tokens = gaze.in_tokens(jnp.asarray(found), (6, 8))
+    tokens = attention.in_tokens(jnp.asarray(found), (6, 8))
     assert np.flatnonzero(tokens).tolist() == (list(range(16, 24)) if edge else [])
 
 
 def test_rows_look_further_ahead_the_higher_they_are(world):
-    ahead = gaze.ahead(world)
+    ahead = attention.ahead(world)
     assert ahead.shape == (6,) and (np.diff(ahead) < 0).all()
     # the camera is 1.0 to 1.2 m up and looks down by 50 deg -+ 29 deg: the row in the image's upper
     # sixth has 25.2 deg, so 1.0 / tan(25.2 deg) = 2.1 to 2.6 m, and a few cm from pelvis to camera
@@ -313,16 +314,16 @@ def test_the_mean_map_is_as_rich_as_attention_that_never_moves():
 
 def test_onsets():
     flag = np.array([True, True, False, True, False])
-    assert watch.onsets(flag).tolist() == [True, False, False, True, False]
+    assert recorder.onsets(flag).tolist() == [True, False, False, True, False]
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: watch.crowd(0, 9), "--num-envs must be at least 1"),
-        (lambda: watch.steps_of(0.0, Config()), "--seconds must be above 0, up to 40"),
-        (lambda: watch.steps_of(float("nan"), Config()), "--seconds must be above 0"),
-        (lambda: watch.kind_of_lane(Config(), "gpa"), "did you mean 'gap'"),
+        (lambda: recorder.default_num_envs(0, 9), "--num-envs must be at least 1"),
+        (lambda: recorder.steps_of(0.0, Config()), "--seconds must be above 0, up to 40"),
+        (lambda: recorder.steps_of(float("nan"), Config()), "--seconds must be above 0"),
+        (lambda: recorder.kind_of_lane(Config(), "gpa"), "did you mean 'gap'"),
         (lambda: cli.writable(Path("gate.jpg"), ".png"), "--out must end in .png"),
     ],
 )
@@ -402,12 +403,14 @@ def counted(world: World, moment: Moment) -> Count:
 def test_nothing_counts_from_a_robots_end_on():
     blind = policy("blind")
     world = build_world(blind.config, "mujoco")
-    world = watch.placed(blind.config, world, lanes.single(Config().terrain, "flat", 0.0), 0.6)
-    robots = watch.begin(world, 0, 4)
-    watched = watch.watch(world, blind.train, robots, 200, counted)
+    world = recorder.place_robots(
+        blind.config, world, lanes.single(Config().terrain, "flat", 0.0), 0.6
+    )
+    robots = recorder.begin(world, 0, 4)
+    watched = recorder.watch(world, blind.train, robots, 200, counted)
     alive, seen = watched
     assert alive[0].all() and not alive[-1].any()  # a random policy falls within 4 s
-    assert len(alive) % watch.CHUNK == 0 and len(alive) < 200  # and then it is over
+    assert len(alive) % recorder.CHUNK == 0 and len(alive) < 200  # and then it is over
     number = np.arange(1, 1 + len(alive))[:, None] + np.zeros((1, 4), int)
     np.testing.assert_array_equal(seen.step[alive], number[alive])  # the first episode, whole
     first = seen.over.argmax(axis=0)

@@ -6,16 +6,19 @@ import pytest
 import stepper
 from random_policy import ROBOT
 
-from cref_jax import config, deploy, evaluation, ood, robot, stand_in
+from cref_jax import config, deploy, robot
 from cref_jax.config import Config
 from cref_jax.deploy import Status
-from cref_jax.disturbance import Channel, Disturbance
 from cref_jax.errors import ConfigError
-from cref_jax.stand_in import StandIn, Start
+from cref_jax.evaluation import protocol
 from cref_jax.terrain import lanes
+from cref_jax.whole_body import scene_files, termination
+from cref_jax.whole_body.disturbances import Channel, Disturbance
+from cref_jax.whole_body.simulator import WholeBodySim
+from cref_jax.whole_body.trial import Start, _initial_state, run_trial
 
-C = evaluation.evaluation_config(Config())
-SCENES = ood.scenes()
+C = protocol.evaluation_config(Config())
+SCENES = scene_files.scenes()
 HEAD = 'title = "a scene"\nend = 6.0\nwidth = 1.4\n'
 STANDING = Start(
     np.array([0.7, 0.0, ROBOT.standing_height, 1.0, 0.0, 0.0, 0.0]), ROBOT.nominal_pose, 0.5
@@ -47,13 +50,13 @@ def scene(tmp_path):
     def read(text, head=HEAD):
         path = tmp_path / "mine.toml"
         path.write_text(head + text)
-        return ood.load(path)
+        return scene_files.load(path)
 
     return read
 
 
 def on(ground, friction=robot.FRICTION):
-    return StandIn(C, ground, ROBOT.joint_names, friction)
+    return WholeBodySim(C, ground, ROBOT.joint_names, friction)
 
 
 def placed(body, **changes):
@@ -61,7 +64,7 @@ def placed(body, **changes):
     base = np.array(STANDING.base)
     for name, value in changes.items():
         base["xyz".index(name)] = value
-    return stand_in._placed(body, STANDING._replace(base=base))
+    return _initial_state(body, STANDING._replace(base=base))
 
 
 def down(ground, x, y, z=1.0):
@@ -81,14 +84,14 @@ def test_there_are_twenty_scenes_each_of_its_own_title_and_with_its_source():
     assert len(SCENES) == 20
     assert len({s.title for s in SCENES.values()}) == 20
     for name in SCENES:
-        text = (ood.directory() / f"{name}.toml").read_text(encoding="utf-8")
+        text = (scene_files.directory() / f"{name}.toml").read_text(encoding="utf-8")
         head = [line for line in text.splitlines()[:3] if line.startswith("#")]
         assert len(head) >= 2 and "assumed" in " ".join(head), name
 
 
 def test_every_look_has_a_colour():
     used = {solid.look for s in SCENES.values() for solid in s.solids}
-    assert used <= set(ood.COLOURS) == set(ood.Look.__args__)
+    assert used <= set(scene_files.COLOURS) == set(scene_files.Look.__args__)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -226,7 +229,7 @@ def test_a_scene_has_an_end_and_a_width(scene):
 
 def test_an_unknown_scene_is_one_line():
     with pytest.raises(ConfigError, match="did you mean 'steel_grate'"):
-        ood.named("steel_grates")
+        scene_files.named("steel_grates")
 
 
 @pytest.mark.parametrize("mu", [0.4, 0.9, 1.0])
@@ -278,7 +281,7 @@ def test_a_foot_stands_across_slots_that_its_spheres_would_sink_into(scene):
 
 def judged(body, state):
     """Return how a trial that begins at the nominal pose ends in this state."""
-    return stand_in._Judge(body, placed(body)).ending(state, body.foot_force(state))
+    return termination.TerminationChecker(body, placed(body)).ending(state, body.foot_force(state))
 
 
 def rail(y):
@@ -327,20 +330,20 @@ def test_a_trial_in_a_scene_ends_at_its_end_or_beside_it(scene, changes, ending)
 def test_who_does_not_come_forward_stalls_after_ten_seconds(scene):
     body = on(scene(""))
     state = placed(body)
-    judge = stand_in._Judge(body, state, speed=0.5)
+    judge = termination.TerminationChecker(body, state, speed=0.5)
     endings = [judge.ending(state, body.foot_force(state)) for _ in range(501)]
     assert endings.index("stalled") == 499  # 500 control steps after the first state
 
 
 def test_standing_is_no_success(scene):
-    trial = stand_in.run(on(scene("")), Standing(), STANDING, 40.0)
+    trial = run_trial(on(scene("")), Standing(), STANDING, 40.0)
     assert trial.ending in ("stalled", "low", "tilted", "hit")
 
 
 @pytest.mark.parametrize("latency", [1, 3, 5])
 def test_a_late_frame_is_as_old_as_it_is_said_to_be(scene, latency):
     policy = Standing()
-    stand_in.run(on(scene("")), policy, STANDING, 0.5, Disturbance(latency=latency))
+    run_trial(on(scene("")), policy, STANDING, 0.5, Disturbance(latency=latency))
     ages = [now - stamp for now, (_, stamp) in zip(policy.came, policy.frames, strict=True)]
     assert len(ages) >= 6
     np.testing.assert_allclose(ages, 0.02 * latency)
@@ -349,8 +352,8 @@ def test_a_late_frame_is_as_old_as_it_is_said_to_be(scene, latency):
 def test_lost_frames_never_reach_the_policy(scene):
     body, bad = on(scene("")), Disturbance(dropped=0.5, seed=3)
     whole, less = Standing(), Standing()
-    stand_in.run(body, whole, STANDING, 1.0)
-    stand_in.run(body, less, STANDING, 1.0, bad)
+    run_trial(body, whole, STANDING, 1.0)
+    run_trial(body, less, STANDING, 1.0, bad)
     channel = Channel(bad)
     kept = [stamp for _, stamp in whole.frames if not channel.loses_one()]
     assert [stamp for _, stamp in less.frames] == kept
@@ -359,7 +362,7 @@ def test_lost_frames_never_reach_the_policy(scene):
 
 def test_a_policy_is_shown_blind_regions(scene):
     policy = Standing()
-    stand_in.run(on(scene("")), policy, STANDING, 0.5, Disturbance(invalid=0.4))
+    run_trial(on(scene("")), policy, STANDING, 0.5, Disturbance(invalid=0.4))
     for image, _ in policy.frames:
         missing = np.isnan(image) | (image == 0.0)
         assert missing.mean() >= 0.4 - 1e-3

@@ -7,17 +7,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cref_jax import deploy, ood, ood_suite, ood_verdict
+from cref_jax import deploy
 from cref_jax.deploy import Status
-from cref_jax.disturbance import Disturbance
 from cref_jax.errors import ConfigError
-from cref_jax.ood_suite import CONDITIONS, GOOD
-from cref_jax.ood_verdict import Condition, Outcome
+from cref_jax.evaluation import scene_results, scene_suite
+from cref_jax.evaluation.scene_results import Condition, Outcome
+from cref_jax.evaluation.scene_suite import CONDITIONS, GOOD
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.system import parallel
+from cref_jax.whole_body import scene_files
+from cref_jax.whole_body.disturbances import Disturbance
 
-FEW = {name: ood.named(name) for name in ("flagstones", "steel_grate")}
+FEW = {name: scene_files.named(name) for name in ("flagstones", "steel_grate")}
 
 
 def outcome(ending, seconds=9.0, status=Status.OK):
@@ -29,15 +31,15 @@ def arguments(seed=0):
 
 
 def runner():
-    return ood_suite._Runner(*arguments())
+    return scene_suite._Runner(*arguments())
 
 
 def outcomes(jobs, seed=0, workers=1):
-    return parallel.run(ood_suite._Runner, arguments(seed), jobs, workers)
+    return parallel.run(scene_suite._Runner, arguments(seed), jobs, workers)
 
 
 def jobs(count, condition=GOOD):
-    return [ood_suite._Job(name, n, condition) for name in FEW for n in range(count)]
+    return [scene_suite._Job(name, n, condition) for name in FEW for n in range(count)]
 
 
 def test_a_trial_is_the_same_however_many_are_asked_for():
@@ -66,11 +68,11 @@ def test_a_trial_starts_in_the_same_way_under_every_condition(monkeypatch):
         begun.append((start.base, start.speed, disturbance))
         raise StopIteration
 
-    monkeypatch.setattr(ood_suite.stand_in, "run", note)
+    monkeypatch.setattr(scene_suite.stand_in, "run", note)
     r = runner()
     for condition in (GOOD, *CONDITIONS):
         with pytest.raises(StopIteration):
-            r.trial(ood_suite._Job("flagstones", 3, condition))
+            r.trial(scene_suite._Job("flagstones", 3, condition))
     bases, speeds, disturbances = zip(*begun, strict=True)
     assert len({tuple(base) for base in bases}) == len(set(speeds)) == 1
     assert len({d.seed for d in disturbances}) == 1
@@ -78,7 +80,7 @@ def test_a_trial_starts_in_the_same_way_under_every_condition(monkeypatch):
 
 def test_starts_are_where_they_should_be():
     body = runner()._body("flagstones", 0.9)
-    starts = [ood_suite.start(body, "flagstones", 0, n) for n in range(200)]
+    starts = [scene_suite.start(body, "flagstones", 0, n) for n in range(200)]
     bases = np.array([s.base for s in starts])
     yaw = 2.0 * np.arctan2(bases[:, 6], bases[:, 3])
     for values, (low, high) in [
@@ -117,8 +119,10 @@ class Standing(deploy.Policy):
 
 def test_a_policy_that_does_nothing_passes_nothing(monkeypatch):
     joints = runner().policy().joints
-    monkeypatch.setattr(ood_suite._Runner, "policy", lambda self: Standing(joints))
-    verdict = ood_suite.judge(None, trials=2, stress_trials=1, seconds=2.0, scenes=FEW, workers=1)
+    monkeypatch.setattr(scene_suite._Runner, "policy", lambda self: Standing(joints))
+    verdict = scene_suite.run_scenes(
+        None, trials=2, stress_trials=1, seconds=2.0, scenes=FEW, workers=1
+    )
     assert verdict.passed == 0
     assert [r.trials for r in verdict.scenes] == [2, 2]
     assert [r.trials for r in verdict.conditions] == [4] + [2] * len(CONDITIONS)
@@ -126,20 +130,20 @@ def test_a_policy_that_does_nothing_passes_nothing(monkeypatch):
     assert all(sum(r.failures.values()) == r.trials for r in verdict.conditions)
     json.dumps(verdict.as_dict(), allow_nan=False)
     out = StringIO()
-    ood_verdict.show(verdict, Console(file=out, width=140))
+    scene_results.show(verdict, Console(file=out, width=140))
     for title in (*(s.title for s in FEW.values()), *(c.name for c in CONDITIONS)):
         assert title in out.getvalue()
 
 
 def test_half_of_the_trials_pass_a_scene():
     won, lost = outcome("finished"), outcome("low")
-    assert ood_verdict.is_passed([won, lost])
-    assert not ood_verdict.is_passed([won, lost, lost])
+    assert scene_results.is_passed([won, lost])
+    assert not scene_results.is_passed([won, lost, lost])
     table = {
         GOOD: {"a": [won, lost], "b": [lost, outcome("hit"), won]},
         CONDITIONS[0]: {"a": [lost], "b": [won]},
     }
-    verdict = ood_verdict.verdict({"a": "A", "b": "B"}, table)
+    verdict = scene_results.verdict({"a": "A", "b": "B"}, table)
     assert verdict.passed == 1
     assert [r.passed for r in verdict.conditions] == [1, 1]
     assert [r.successes for r in verdict.scenes] == [1, 1]
@@ -149,45 +153,45 @@ def test_half_of_the_trials_pass_a_scene():
 
 def test_a_scenes_result_worked_by_hand():
     found = [outcome("finished", 8.0), outcome("finished", 12.0), outcome("stalled", 20.0)]
-    result = ood_verdict.scene_result("a", "A", found)
+    result = scene_results.scene_result("a", "A", found)
     assert (result.trials, result.successes, result.failures) == (3, 2, {"stalled": 1})
     assert result.seconds == 10.0
     assert result.wilson_low < result.rate == 2 / 3 < result.wilson_high
-    assert ood_verdict.scene_result("a", "A", found[2:]).seconds is None
+    assert scene_results.scene_result("a", "A", found[2:]).seconds is None
 
 
 def test_what_the_policy_said_is_counted_by_trials():
     both = Status.NO_DEPTH | Status.STALE_DEPTH
     found = [outcome("low", status=both), outcome("low", status=Status.NO_DEPTH)]
-    result = ood_verdict.condition_result(GOOD, {"a": found})
+    result = scene_results.condition_result(GOOD, {"a": found})
     assert result.said == {"NO_DEPTH": 2, "STALE_DEPTH": 1}
 
 
 @pytest.mark.parametrize("bad", [{"trials": 0}, {"stress_trials": -1}, {"seed": -1}])
 def test_numbers_that_cannot_be_are_one_line(bad):
     with pytest.raises(ConfigError, match="trials must be at least 1"):
-        ood_suite.judge(**bad)
+        scene_suite.run_scenes(**bad)
 
 
 def test_a_folder_that_is_no_policy_is_one_line(tmp_path):
     with pytest.raises(ConfigError, match="no exported policy"):
-        ood_suite.judge(tmp_path)
+        scene_suite.run_scenes(tmp_path)
 
 
 def test_a_film_is_an_mp4(tmp_path):
     with pytest.raises(ConfigError, match=r"must end in \.mp4"):
-        ood_suite.film(None, "curbs", tmp_path / "film.gif")
+        scene_suite.film(None, "curbs", tmp_path / "film.gif")
 
 
 @pytest.mark.slow
 def test_a_trial_can_be_filmed(tmp_path, monkeypatch):
-    monkeypatch.setattr(ood_suite, "SIZE", (64, 48))
-    monkeypatch.setattr(ood_suite, "TRIAL_SECONDS", 0.2)
+    monkeypatch.setattr(scene_suite, "SIZE", (64, 48))
+    monkeypatch.setattr(scene_suite, "TRIAL_SECONDS", 0.2)
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     try:
         robot_scene.Canvas(model, 8, 8).__exit__()
     except ConfigError as error:
         pytest.skip(str(error))
-    trial = ood_suite.film(None, "curbs", tmp_path / "film.mp4")
+    trial = scene_suite.film(None, "curbs", tmp_path / "film.mp4")
     assert len(trial.qpos) == math.ceil(0.2 / 0.02)
     assert (tmp_path / "film.mp4").stat().st_size > 500

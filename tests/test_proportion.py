@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cref_jax import proportion
-from cref_jax.proportion import Rate, wilson
+from cref_jax.evaluation import intervals
+from cref_jax.evaluation.intervals import Rate, wilson
 
 
 def test_the_interval_of_eighty_one_of_two_hundred_and_sixty_three():
@@ -39,24 +39,24 @@ def test_no_failure_does_not_mean_certainty_and_no_trial_means_nothing():
     ],
 )
 def test_the_interval_of_a_difference(a, b, low, high):
-    found = proportion.difference(wilson(*a), wilson(*b))
+    found = intervals.difference(wilson(*a), wilson(*b))
     assert (found.low, found.high) == pytest.approx((low, high), abs=5e-5)
 
 
 def test_a_difference_is_significant_where_zero_lies_outside():
-    assert proportion.is_significant(proportion.difference(wilson(56, 70), wilson(48, 80)))
-    assert not proportion.is_significant(proportion.difference(wilson(5, 56), wilson(0, 29)))
-    assert not proportion.is_significant(Rate(0.0, 0.0, 0.0))
+    assert intervals.is_significant(intervals.difference(wilson(56, 70), wilson(48, 80)))
+    assert not intervals.is_significant(intervals.difference(wilson(5, 56), wilson(0, 29)))
+    assert not intervals.is_significant(Rate(0.0, 0.0, 0.0))
 
 
 def test_the_interval_of_a_mean_covers_it_as_often_as_it_says():
     rng, shares, n = np.random.default_rng(0), np.array([0.98, 0.9, 0.5, 0.75]), 100
     covered = 0
     for _ in range(2000):
-        mean = proportion.mean([wilson(int(k), n) for k in rng.binomial(n, shares)])
+        mean = intervals.mean([wilson(int(k), n) for k in rng.binomial(n, shares)])
         covered += mean.low <= shares.mean() <= mean.high
     assert 0.93 < covered / 2000 < 0.97  # four standard deviations are 0.02
 
 
 def test_the_mean_of_one_rate_is_itself():
-    assert proportion.mean([wilson(3, 9)]) == pytest.approx(wilson(3, 9))
+    assert intervals.mean([wilson(3, 9)]) == pytest.approx(wilson(3, 9))

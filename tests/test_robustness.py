@@ -4,21 +4,22 @@ import numpy as np
 import pytest
 import sample
 
-from cref_jax import ppo, robustness
+from cref_jax import ppo
 from cref_jax.config import Randomisation
-from cref_jax.robustness import EVERYTHING, PARTS
+from cref_jax.evaluation import robustness_suite
+from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS
 
 
 @pytest.fixture(scope="module")
 def world():
-    return robustness.world(sample.C, sample.world().physics)
+    return robustness_suite.world(sample.C, sample.world().physics)
 
 
 def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():
-    rows = robustness.rows()
+    rows = robustness_suite.rows()
     whole = [row for row in rows if row.part == EVERYTHING]
     assert len(whole) == 14 and len(rows) == 14 + 8 * 4
-    sizes = {(row.kind, robustness.size(row.kind, row.level)) for row in whole}
+    sizes = {(row.kind, robustness_suite.size(row.kind, row.level)) for row in whole}
     assert {("gap", 0.90), ("platform", 0.45), ("stairs", 0.23)} < sizes
     for part in PARTS:
         assert [row.kind for row in rows if row.part == part] == [
@@ -38,22 +39,22 @@ def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
         seen.append(asked)
         one = np.ones(len(asked.number), np.float32)
         ending = (asked.number % 2).astype(int)
-        return robustness.Trials(one, ending, one, one, one, one)
+        return robustness_suite.Trials(one, ending, one, one, one, one)
 
-    monkeypatch.setattr(robustness.trials, "run", run)
-    found = robustness.judge(world, ppo.TrainState(*5 * [None]), 10, 0)
+    monkeypatch.setattr(robustness_suite.trials, "run", run)
+    found = robustness_suite.run_rows(world, ppo.TrainState(*5 * [None]), 10, 0)
     (asked,) = seen
-    for k, row in enumerate(robustness.rows()):
+    for k, row in enumerate(robustness_suite.rows()):
         part = slice(10 * k, 10 * k + 10)
         names = {world.lanes.kinds[kind] for kind in asked.kind[part]}
-        assert names == set(robustness.LANES[row.kind])
+        assert names == set(robustness_suite.LANES[row.kind])
         sizes = world.lanes.sizes[asked.level[part], asked.kind[part]]
-        np.testing.assert_allclose(sizes, robustness.size(row.kind, row.level))
+        np.testing.assert_allclose(sizes, robustness_suite.size(row.kind, row.level))
         shares = {name: set(of[part].tolist()) for name, of in asked.spread._asdict().items()}
         on = {name for name, share in shares.items() if share == {1.0}}
         assert on == (set(PARTS) if row.part == EVERYTHING else {row.part})
         assert all(share in ({0.0}, {1.0}) for share in shares.values())
         np.testing.assert_array_equal(asked.number[part], np.arange(10))
         assert (found[k]["part"], found[k]["trials"], found[k]["successes"]) == (row.part, 10, 5)
-    assert robustness.overall(found)["rate"] == 0.5
-    assert "gap 90 cm" in str(robustness.text(found).columns[0]._cells)
+    assert robustness_suite.overall(found)["rate"] == 0.5
+    assert "gap 90 cm" in str(robustness_suite.text(found).columns[0]._cells)

@@ -8,16 +8,20 @@ import pytest
 from random_policy import ROBOT, contents, policy
 from sample import put
 
-from cref_jax import deploy, depth, evaluation, sim2sim, stand_in, terrain
+from cref_jax import deploy, depth, sim2sim, terrain
 from cref_jax.config import Config
-from cref_jax.disturbance import Disturbance
 from cref_jax.env import commands, environment, events
+from cref_jax.evaluation import crossing, protocol
 from cref_jax.physics.records import Body
 from cref_jax.physics.simulation import Physics
 from cref_jax.rendering import robot_scene
-from cref_jax.stand_in import Lane, StandIn, Start
+from cref_jax.whole_body import termination
+from cref_jax.whole_body.disturbances import Disturbance
+from cref_jax.whole_body.ground import Lane
+from cref_jax.whole_body.simulator import WholeBodySim
+from cref_jax.whole_body.trial import Start, _initial_state, _is_due, lane_command, run_trial
 
-C = evaluation.evaluation_config(Config())
+C = protocol.evaluation_config(Config())
 FLAT = Lane(np.zeros((600, 200), np.float32), np.array([0.0, -2.0], np.float32), 0.02, 11.0)
 STANDING = Start(
     np.array([0.7, 0.0, ROBOT.standing_height, 1.0, 0.0, 0.0, 0.0], np.float32),
@@ -27,7 +31,7 @@ STANDING = Start(
 
 
 def on_lane(lane=FLAT):
-    return StandIn(C, lane, ROBOT.joint_names)
+    return WholeBodySim(C, lane, ROBOT.joint_names)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +48,12 @@ def placed(body, **changes):
     base = np.array(STANDING.base)
     for name, value in changes.items():
         base[{"x": 0, "y": 1, "z": 2, "rotation": slice(3, 7)}[name]] = value
-    return stand_in._placed(body, STANDING._replace(base=base))
+    return _initial_state(body, STANDING._replace(base=base))
 
 
 def gap_world():
     c = dataclasses.replace(C, terrain=dataclasses.replace(C.terrain, name="gap"))
-    return evaluation.crossing_world(c, Physics(c.robot, c.physics, "mujoco"), "gap", 0.5)
+    return crossing.crossing_world(c, Physics(c.robot, c.physics, "mujoco"), "gap", 0.5)
 
 
 def test_it_sees_what_the_robot_sees_in_training():
@@ -61,7 +65,7 @@ def test_it_sees_what_the_robot_sees_in_training():
     for x in (edge - 0.8, edge - 0.3):
         state = placed(body, x=x, rotation=turned)
         ours = body.image(state)
-        at_start = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
+        at_start = jax.tree.map(lambda a: a[0], crossing.first_robots(world, 0, 1).env)
         robot = put(at_start, x=x, y=0.0, z=ROBOT.standing_height, rotation=jnp.array(turned))
         robot = robot.replace(
             body=robot.body._replace(qpos=robot.body.qpos.at[7:].set(world.physics.robot.rest_pose))
@@ -75,7 +79,7 @@ def test_it_sees_what_the_robot_sees_in_training():
 
 def test_the_operator_steers_as_in_training():
     world = gap_world()
-    state = jax.tree.map(lambda a: a[0], evaluation.starts(world, 0, 1).env)
+    state = jax.tree.map(lambda a: a[0], crossing.first_robots(world, 0, 1).env)
     state = state.replace(command_left=jnp.int32(1000))
     command = jax.jit(commands.update_command)
     draws = jax.jit(events.draw)(world, state, jax.random.key(0), jax.random.key(1))
@@ -83,14 +87,14 @@ def test_the_operator_steers_as_in_training():
         rotation = jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
         there = put(state, y=y, rotation=rotation)
         expected = command(world, there, draws).command
-        found = stand_in.steered(C.command, float(state.command[0]), np.asarray(there.body.qpos))
+        found = lane_command(C.command, float(state.command[0]), np.asarray(there.body.qpos))
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_frames_come_when_they_come_in_training():
     period = C.physics.control_period
     for step in range(1, 101):
-        assert stand_in._is_due(step, C) == depth.is_due(step, C.camera, period)
+        assert _is_due(step, C) == depth.is_due(step, C.camera, period)
 
 
 def test_the_ground_bears_the_robots_weight(body):
@@ -124,7 +128,7 @@ def test_a_foot_relieved_for_a_moment_still_bears(body):
     state.xpos[body.feet, 2] = [0.51, 0.07]
     state.qpos[2] = 0.64
     landing, bearing = [0.0, 0.0, 400.0], [0.0, 0.0, 300.0]
-    judge = stand_in._Judge(body, state)
+    judge = termination.TerminationChecker(body, state)
     assert judge.ending(state, np.array([landing, bearing])) is None
     assert judge.ending(state, np.array([landing, [0.0, 0.0, 0.0]])) == "low"
 
@@ -140,7 +144,7 @@ def test_a_foot_relieved_for_a_moment_still_bears(body):
     ],
 )
 def test_a_trial_ends_as_an_episode_does(body, changes, ending):
-    judge = stand_in._Judge(body, placed(body))
+    judge = termination.TerminationChecker(body, placed(body))
     state = placed(body, **changes)
     if ending == "unstable":
         mujoco.mj_step(body.model, state)
@@ -151,7 +155,7 @@ def test_a_foot_far_below_the_last_support_has_dropped():
     heights = np.zeros((600, 200), np.float32)
     heights[60:] = -1.0
     body = on_lane(Lane(heights, FLAT.origin, FLAT.cell, FLAT.end))
-    judge = stand_in._Judge(body, placed(body))
+    judge = termination.TerminationChecker(body, placed(body))
     judge._support += 0.6
     assert judge.ending(placed(body, x=5.0), np.zeros((2, 3))) in ("low", "dropped")
 
@@ -163,7 +167,7 @@ def test_upper_body_on_the_ground_is_a_hit(body):
 
 
 def test_a_trial_is_the_same_twice_and_says_how_it_went(body):
-    first, second = (stand_in.run(body, runtime(), STANDING, 0.5) for _ in range(2))
+    first, second = (run_trial(body, runtime(), STANDING, 0.5) for _ in range(2))
     np.testing.assert_array_equal(first.qpos, second.qpos)
     assert first.ending in ("late", "low", "tilted", "hit")
     assert first.seconds == pytest.approx(len(first.qpos) * 0.02)
@@ -172,12 +176,12 @@ def test_a_trial_is_the_same_twice_and_says_how_it_went(body):
 
 
 def test_frames_that_come_too_late_are_noticed(body):
-    late = stand_in.run(body, runtime(), STANDING, 0.4, Disturbance(latency=8))
+    late = run_trial(body, runtime(), STANDING, 0.4, Disturbance(latency=8))
     assert late.status & deploy.Status.STALE_DEPTH
 
 
 def test_a_blind_policy_walks_without_frames(body):
-    trial = stand_in.run(body, runtime("blind"), STANDING, 0.2)
+    trial = run_trial(body, runtime("blind"), STANDING, 0.2)
     assert trial.status & ~deploy.Status.RANGE_LIMITED & ~deploy.Status.RATE_LIMITED == 0
 
 
@@ -191,4 +195,4 @@ def test_nothing_of_jax_is_in_the_loop(body, monkeypatch):
         monkeypatch.setattr(jax, name, refuse)
     monkeypatch.setattr(jnp, "asarray", refuse)
     monkeypatch.setattr(jax._src.core.Primitive, "bind", refuse)
-    stand_in.run(body, policy, STANDING, 0.1)
+    run_trial(body, policy, STANDING, 0.1)

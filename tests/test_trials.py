@@ -9,12 +9,13 @@ import pytest
 from random_policy import SMALL
 from sample import assert_equal, one
 
-from cref_jax import config, evaluation, table, trials
+from cref_jax import config
 from cref_jax.config import Config
 from cref_jax.env.state import Ending
+from cref_jax.evaluation import crossing, protocol, tables, trials
+from cref_jax.evaluation.trials import ENDINGS, Trace
 from cref_jax.physics.simulation import Physics
 from cref_jax.training import rollout
-from cref_jax.trials import ENDINGS, Trace
 
 C = config.override(
     Config(),
@@ -35,7 +36,7 @@ def physics():
 
 @pytest.fixture(scope="module")
 def world(physics):
-    return evaluation.crossing_world(C, physics, "flat", 0.0)
+    return crossing.crossing_world(C, physics, "flat", 0.0)
 
 
 def held(env, body, x, z):
@@ -78,7 +79,7 @@ carried, stands, falls, blows_up = (
 
 
 def asked(count):
-    return trials.Asked(np.arange(count), *evaluation.crossing_lanes(count))
+    return trials.Asked(np.arange(count), *crossing.crossing_lanes(count))
 
 
 def run(world, walker, count=4, block=3, seed=0):
@@ -148,9 +149,9 @@ def test_a_trial_begins_when_frames_come_as_at_first():
 
 def test_a_robot_begins_among_others_that_go_on(physics):
     c = dataclasses.replace(C, network=SMALL)
-    world = evaluation.crossing_world(c, physics, "flat", 0.0)
+    world = crossing.crossing_world(c, physics, "flat", 0.0)
     old, new = (
-        trials.begin(world, seed, np.arange(2), *evaluation.crossing_lanes(2)) for seed in (0, 1)
+        trials.begin(world, seed, np.arange(2), *crossing.crossing_lanes(2)) for seed in (0, 1)
     )
     old = old.replace(feed=old.feed.replace(clock=jnp.int32(50), fresh=jnp.array(True)))
     memory = jax.tree.map(jnp.ones_like, old.memory)
@@ -212,23 +213,23 @@ def test_what_comes_first_decides(flags, progress, ending, seconds):
 
 def test_stairs_are_tried_up_and_down_and_every_lane_in_turn(physics):
     kinds = ("ascent", "descent", "gap", "platform")
-    up_down = table.lanes_of(("stairs", "hard"), 20, kinds)
+    up_down = tables.lanes_of(("stairs", "hard"), 20, kinds)
     np.testing.assert_array_equal(up_down.kind, [0, 1] * 10)
-    variants = len(evaluation.LANE_SEEDS)
+    variants = len(protocol.LANE_SEEDS)
     assert variants == 5
     np.testing.assert_array_equal(up_down.level[:12] - 10, [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0])
-    gap = table.lanes_of(("gap", "easy"), 6, kinds)
+    gap = tables.lanes_of(("gap", "easy"), 6, kinds)
     np.testing.assert_array_equal(gap.kind, 2)
     np.testing.assert_array_equal(gap.level, [0, 1, 2, 3, 4, 0])
 
 
 def test_the_worlds_lanes_have_the_sizes_of_the_cells(physics):
-    world = table.world(C, physics)
+    world = tables.world(C, physics)
     kinds = world.lanes.kinds
     for cell, kind in {("stairs", "medium"): "descent", ("platform", "ood"): "platform"}.items():
-        on = table.lanes_of(cell, 10, kinds)
+        on = tables.lanes_of(cell, 10, kinds)
         sizes = world.lanes.sizes[on.level, kinds.index(kind)]
-        np.testing.assert_array_equal(sizes, table.sizes()[cell[0]][cell[1]])
+        np.testing.assert_array_equal(sizes, tables.cell_sizes()[cell[0]][cell[1]])
     assert all(world.lanes.is_profile)  # so that kinds may share a block: see rollout.exposed
 
 
@@ -243,15 +244,15 @@ def outcomes(successes, count, **how):
     """Return the same outcome in every cell; the second half of stairs goes down."""
     down = np.arange(count) >= count // 2
     return {
-        cell: table.Outcomes(made(successes, count, **how), down & (cell[0] == "stairs"))
+        cell: tables.Outcomes(made(successes, count, **how), down & (cell[0] == "stairs"))
         for cell in dict.fromkeys(
-            (kind, level) for kind in table.LANES for level in ("easy", "medium", "hard", "ood")
+            (kind, level) for kind in tables.LANES for level in ("easy", "medium", "hard", "ood")
         )
     }
 
 
 def test_a_row_counts_failures_by_way_cause_and_speed():
-    row = table.cells([outcomes(7, 10, speed=0.65, cause="hit")])[0]
+    row = tables.cells([outcomes(7, 10, speed=0.65, cause="hit")])[0]
     assert (row["kind"], row["level"], row["size_m"]) == ("stairs", "easy", 0.10)
     assert (row["trials"], row["successes"], row["rate"]) == (10, 7, 0.7)
     assert (row["up_failures"], row["down_failures"]) == (0, 3)
@@ -265,12 +266,12 @@ def test_a_row_counts_failures_by_way_cause_and_speed():
 
 
 def test_several_policies_are_pooled_with_their_spread():
-    rows = table.cells([outcomes(10, 10), outcomes(4, 10), outcomes(7, 10)])
+    rows = tables.cells([outcomes(10, 10), outcomes(4, 10), outcomes(7, 10)])
     row = rows[-1]
     assert (row["trials"], row["successes"]) == (30, 21)
     assert row["by_policy"] == [1.0, 0.4, 0.7] and row["spread"] == pytest.approx(0.3)
     assert row["up_failures"] is None
-    whole = table.overall(rows)
+    whole = tables.overall(rows)
     assert [whole[key] for key in ("rate", "trained", "ood")] == pytest.approx([0.7, 0.7, 0.7])
     assert whole["paper"] == pytest.approx(0.904583, abs=1e-5)
     assert whole["paper_trained"] == pytest.approx(0.981111, abs=1e-5)
@@ -278,10 +279,10 @@ def test_several_policies_are_pooled_with_their_spread():
 
 def test_the_width_of_the_interval_is_said():
     # Wilson at 50 of 100: 0.4038 to 0.5962
-    assert "+-9.6 at 50 %" in table.width(100)
+    assert "+-9.6 at 50 %" in tables.interval_note(100)
 
 
 def test_training_settings_do_not_change_the_compiled_program():
     a = config.override(C, {"run": {"seed": 3}, "ppo": {"epochs": 1}, "terrain": {"name": "gap"}})
-    assert evaluation.trial_config(a) == evaluation.trial_config(C)
-    assert dataclasses.replace(evaluation.trial_config(a)).episode.length == 40.0
+    assert protocol.trial_config(a) == protocol.trial_config(C)
+    assert dataclasses.replace(protocol.trial_config(a)).episode.length == 40.0

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from rich.table import Table
 
-from cref_jax import paper, proportion, table
-from cref_jax.evaluation import Crossing
+from cref_jax.evaluation import intervals, paper_results, tables
+from cref_jax.evaluation.crossing import Crossing
 
 Lane = tuple[str, float]  # kind of lane, size of its obstacles in m
 
@@ -33,9 +33,9 @@ class Cell(NamedTuple):
 def lanes() -> dict[str, tuple[Lane, ...]]:
     """Return the lanes of flat ground and of each cell of Table II, by the cell's name."""
     found: dict[str, tuple[Lane, ...]] = {"flat": (("flat", 0.0),)}
-    for kind, level in paper.METHODS[paper.FULL].success:
-        size = table.sizes()[kind][level]
-        found[f"{kind} {100 * size:.0f} cm"] = tuple((lane, size) for lane in table.LANES[kind])
+    for kind, level in paper_results.METHODS[paper_results.FULL].success:
+        size = tables.cell_sizes()[kind][level]
+        found[f"{kind} {100 * size:.0f} cm"] = tuple((lane, size) for lane in tables.LANES[kind])
     return found
 
 
@@ -58,7 +58,7 @@ def text(cells: Sequence[Cell]) -> Table:
     shown.add_column("failures of the whole robot")
     for cell in cells:
         count = trials(cell.stand_in)
-        rate = proportion.wilson(successes(cell.stand_in), count)
+        rate = intervals.wilson(successes(cell.stand_in), count)
         causes: dict[str, int] = {}
         for crossing in cell.stand_in:
             for cause, n in crossing.by_cause.items():

@@ -18,7 +18,7 @@ def spans(
     return np.abs(y[last, np.arange(y.shape[1])]), np.where(lived, np.abs(y), 0.0).max(axis=0)
 
 
-def summed(drift: Float[np.ndarray, " N"], largest: Float[np.ndarray, " N"]) -> dict[str, float]:
+def summarize(drift: Float[np.ndarray, " N"], largest: Float[np.ndarray, " N"]) -> dict[str, float]:
     """Return the figures of all trials from those of each, m: as JSON has them.
 
     `drift_m` is the mean of |y| at the end, `largest_m` that of the largest |y|, `worst_m` the

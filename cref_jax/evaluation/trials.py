@@ -19,12 +19,13 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from cref_jax import depth, ppo, sideways
+from cref_jax import depth, ppo
 from cref_jax.config import Config
 from cref_jax.env import resets, stall
 from cref_jax.env.environment import Outcome
 from cref_jax.env.state import Ending, Spread, even_spread
 from cref_jax.env.world import World
+from cref_jax.evaluation import lateral_drift
 from cref_jax.training import rollout
 from cref_jax.training.rollout import Robots
 
@@ -155,7 +156,7 @@ def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trial
         ENDINGS.index("late"),
     )
     lived = np.arange(steps)[:, None] <= last
-    drift, aside = sideways.spans(np.asarray(trace.y), lived)
+    drift, aside = lateral_drift.spans(np.asarray(trace.y), lived)
     return Trials(
         speed=speed,
         ending=ending,

@@ -10,9 +10,9 @@ from rich.table import Table
 
 from cref_jax import robot
 from cref_jax.deploy import Status
-from cref_jax.disturbance import UNDISTURBED, Disturbance
-from cref_jax.proportion import wilson
-from cref_jax.sideways import summed
+from cref_jax.evaluation.intervals import wilson
+from cref_jax.evaluation.lateral_drift import summarize
+from cref_jax.whole_body.disturbances import UNDISTURBED, Disturbance
 
 PASSED = 0.5  # share of a scene's trials that must come to its end; assumed: the paper counts
 # scenes, and does not say what it takes
@@ -130,7 +130,7 @@ def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneRes
         wilson_high=rate.high,
         seconds=float(np.mean(seconds)) if seconds else None,
         passed=is_passed(outcomes),
-        sideways=summed(
+        sideways=summarize(
             np.array([o.drift for o in outcomes]), np.array([o.aside for o in outcomes])
         ),
     )

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from rich.table import Table
 
-from cref_jax import evaluation, geometry, ppo, trials
+from cref_jax import geometry, ppo
 from cref_jax.config import Config
 from cref_jax.env.world import World, make_world
+from cref_jax.evaluation import protocol, trials
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.training import rollout
@@ -39,7 +40,7 @@ class Trace(NamedTuple):
     fallen: Bool[Array | np.ndarray, "T E"]  # in this step or before
 
 
-def judge(
+def run_commands(
     c: Config, physics: Physics, train: ppo.TrainState, count: int, seed: int
 ) -> dict[str, Any]:
     """Judge `count` trials of each command, and as many of being told to stop."""
@@ -123,7 +124,7 @@ def lines(found: dict[str, Any]) -> str:
 def _world(c: Config, physics: Physics) -> World:
     """Return a flat lane on which no command is drawn."""
     flat = lanes.grid(c.terrain, {"flat": (0.0,)}, (1,))
-    return make_world(evaluation.trial_config(c), physics).replace(lanes=flat)
+    return make_world(protocol.trial_config(c), physics).replace(lanes=flat)
 
 
 @jax.jit(static_argnames="steps")

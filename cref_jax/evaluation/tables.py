@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Int
 from rich.table import Table
 
-from cref_jax import config, evaluation, paper, ppo, proportion, sideways, trials
+from cref_jax import config, ppo
 from cref_jax.config import Config
 from cref_jax.env.world import World, make_world
-from cref_jax.paper import Cell
+from cref_jax.evaluation import intervals, lateral_drift, paper_results, protocol, trials
+from cref_jax.evaluation.intervals import Rate
+from cref_jax.evaluation.paper_results import Cell
+from cref_jax.evaluation.trials import Trials
 from cref_jax.physics.simulation import Physics
-from cref_jax.proportion import Rate
 from cref_jax.terrain import lanes
-from cref_jax.trials import Trials
 
 LANES = {"stairs": ("ascent", "descent"), "gap": ("gap",), "platform": ("platform",)}
 UP, DOWN = 0, 1  # in LANES["stairs"]
@@ -44,37 +45,37 @@ class Outcomes(NamedTuple):
     is_down: Bool[np.ndarray, " N"]  # a flight of stairs down; never true elsewhere
 
 
-def sizes() -> dict[str, dict[str, float]]:
+def cell_sizes() -> dict[str, dict[str, float]]:
     """Return the size of each kind's obstacles at each level, m."""
     return {kind: lanes.named_sizes(config.Terrain(), of[0]) for kind, of in LANES.items()}
 
 
 def world(c: Config, physics: Physics) -> World:
     """Return the world with the lanes of all cells."""
-    sized = {lane: tuple(sizes()[kind].values()) for kind, of in LANES.items() for lane in of}
+    sized = {lane: tuple(cell_sizes()[kind].values()) for kind, of in LANES.items() for lane in of}
     return world_of(c, physics, sized)
 
 
 def world_of(c: Config, physics: Physics, sized: Mapping[str, Sequence[float]]) -> World:
     """Return the world of trials on lanes with obstacles of these sizes of each kind, m."""
-    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, evaluation.LANE_SEEDS)
-    return make_world(evaluation.trial_config(c), physics).replace(lanes=atlas)
+    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, protocol.LANE_SEEDS)
+    return make_world(protocol.trial_config(c), physics).replace(lanes=atlas)
 
 
 def lanes_of(cell: Cell, count: int, kinds: Sequence[str]) -> Lanes:
     """Return the lanes of so many trials of a cell: kinds and seeds in turn."""
-    return in_turn(LANES[cell[0]], paper.LEVELS.index(cell[1]), count, kinds)
+    return round_robin_lanes(LANES[cell[0]], paper_results.LEVELS.index(cell[1]), count, kinds)
 
 
-def in_turn(names: Sequence[str], level: int, count: int, kinds: Sequence[str]) -> Lanes:
+def round_robin_lanes(names: Sequence[str], level: int, count: int, kinds: Sequence[str]) -> Lanes:
     """Return so many lanes of these names and this level, of a world's kinds and seeds in turn."""
-    number, variants = np.arange(count), len(evaluation.LANE_SEEDS)
+    number, variants = np.arange(count), len(protocol.LANE_SEEDS)
     of = np.array([kinds.index(lane) for lane in names])
     first = level * variants
     return Lanes(of[number % len(of)], first + number // len(of) % variants)
 
 
-def judge(
+def run_cells(
     w: World,
     train: ppo.TrainState,
     count: int,
@@ -82,11 +83,11 @@ def judge(
     ended: Callable[[int], None] = lambda count: None,
 ) -> dict[Cell, Outcomes]:
     """Return what a policy makes of `count` trials of each cell; `ended` is told of each end."""
-    every = list(paper.METHODS[paper.FULL].success)
+    every = list(paper_results.METHODS[paper_results.FULL].success)
     on = [lanes_of(cell, count, w.lanes.kinds) for cell in every]
     kind, level = map(np.concatenate, zip(*on, strict=True))
     asked = trials.Asked(np.tile(np.arange(count), len(every)), kind, level)
-    made = trials.run(w, trials.follow(train), asked, seed, evaluation.block(), ended)
+    made = trials.run(w, trials.follow(train), asked, seed, protocol.robots_per_block(), ended)
     down = kind == w.lanes.kinds.index("descent")
     part = lambda k: slice(k * count, (k + 1) * count)
     return {
@@ -102,7 +103,7 @@ def cells(judged: Sequence[Mapping[Cell, Outcomes]]) -> list[dict[str, Any]]:
 
 def overall(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the plain means of all cells, of those inside of training, and of the others."""
-    ours = lambda some: proportion.mean([_rate(row) for row in some])
+    ours = lambda some: intervals.mean([_rate(row) for row in some])
     theirs = lambda some: float(np.mean([row["paper"]["rate"] for row in some]))
     inside = [row for row in rows if row["level"] != "ood"]
     outside = [row for row in rows if row["level"] == "ood"]
@@ -149,7 +150,7 @@ def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
 def failures(rows: Sequence[dict[str, Any]]) -> str:
     """Return how trials failed, in one line a kind of terrain."""
     lines = []
-    for kind in paper.KINDS:
+    for kind in paper_results.KINDS:
         of_kind = [row["failures"] for row in rows if row["kind"] == kind]
         total = {name: sum(row[name] for row in of_kind) for name in trials.FAILURES}
         said = ", ".join(f"{n} {name}" for name, n in total.items() if n) or "none"
@@ -157,11 +158,11 @@ def failures(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def width(count: int) -> str:
+def interval_note(count: int) -> str:
     """Return how sure `count` trials make a rate, in words."""
 
     def half(share: float) -> float:
-        rate = proportion.wilson(round(share * count), count)
+        rate = intervals.wilson(round(share * count), count)
         return 50.0 * (rate.high - rate.low)
 
     return (
@@ -175,12 +176,12 @@ def _cell(cell: Cell, outcomes: list[Outcomes]) -> dict[str, Any]:
     kind, level = cell
     all_trials = Trials(*map(np.concatenate, zip(*(o.trials for o in outcomes), strict=True)))
     lost, is_down = ~all_trials.succeeded, np.concatenate([o.is_down for o in outcomes])
-    rate = proportion.wilson(int((~lost).sum()), len(lost))
+    rate = intervals.wilson(int((~lost).sum()), len(lost))
     by_policy = [float(o.trials.succeeded.mean()) for o in outcomes]
     return {
         "kind": kind,
         "level": level,
-        "size_m": sizes()[kind][level],
+        "size_m": cell_sizes()[kind][level],
         "trials": len(lost),
         "successes": int((~lost).sum()),
         "rate": rate.value,
@@ -190,7 +191,7 @@ def _cell(cell: Cell, outcomes: list[Outcomes]) -> dict[str, Any]:
         "down_failures": int((lost & is_down).sum()) if kind == "stairs" else None,
         "failures": all_trials.failures(),
         "by_speed": _by_speed(all_trials),
-        "sideways": sideways.summed(all_trials.drift, all_trials.aside),
+        "sideways": lateral_drift.summarize(all_trials.drift, all_trials.aside),
         "by_policy": by_policy,
         "spread": float(np.std(by_policy, ddof=1)) if len(by_policy) > 1 else None,
         "paper": _beside(rate, cell),
@@ -213,16 +214,18 @@ def _by_speed(made: Trials) -> list[dict[str, Any]]:
 
 def _beside(ours: Rate, cell: Cell) -> dict[str, Any]:
     """Return the paper's rate, the difference of ours from it and whether it is significant."""
-    successes = round(paper.METHODS[paper.FULL].success[cell] / 100.0 * paper.TRIALS)
-    theirs = proportion.wilson(successes, paper.TRIALS)
-    gap = proportion.difference(ours, theirs)
+    successes = round(
+        paper_results.METHODS[paper_results.FULL].success[cell] / 100.0 * paper_results.TRIALS
+    )
+    theirs = intervals.wilson(successes, paper_results.TRIALS)
+    gap = intervals.difference(ours, theirs)
     return {
         "rate": theirs.value,
-        "trials": paper.TRIALS,
+        "trials": paper_results.TRIALS,
         "difference": gap.value,
         "difference_low": gap.low,
         "difference_high": gap.high,
-        "significant": proportion.is_significant(gap),
+        "significant": intervals.is_significant(gap),
     }
 
 

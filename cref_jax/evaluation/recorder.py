@@ -20,11 +20,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from rich.progress import Progress
 
-from cref_jax import config, evaluation, network, ppo, trials
+from cref_jax import config, network, ppo
 from cref_jax.config import Config
 from cref_jax.env.environment import Outcome
 from cref_jax.env.world import World, build_world, make_world
 from cref_jax.errors import ConfigError
+from cref_jax.evaluation import protocol, trials
 from cref_jax.physics.records import EngineName
 from cref_jax.policy import sources
 from cref_jax.policy.trained import TrainedPolicy
@@ -71,7 +72,7 @@ class Watched(NamedTuple):
     seen: Any  # what was kept of each step, arrays [T, ...]; only those of `alive` count
 
 
-def opened(
+def open_policy(
     run: Path | None, policy: Path | None, engine: EngineName
 ) -> tuple[TrainedPolicy, World]:
     """Return the policy that was asked for, or the newest there is, and the world of its training.
@@ -85,7 +86,7 @@ def opened(
     return sources.load(source, world)._replace(run=source), world
 
 
-def medium(c: Config) -> Atlas:
+def medium_lanes(c: Config) -> Atlas:
     """Return lanes of each kind at its medium size of Table II, or else the middle of training."""
     whole = lanes.build(dataclasses.replace(c.terrain, name="mixed"))
     middle = np.mean(whole.sizes, axis=0).tolist()
@@ -93,7 +94,7 @@ def medium(c: Config) -> Atlas:
         kind: (lanes.named_sizes(c.terrain, kind).get("medium", size),)
         for kind, size in zip(whole.kinds, middle, strict=True)
     }
-    return lanes.grid(c.terrain, sizes, evaluation.LANE_SEEDS)
+    return lanes.grid(c.terrain, sizes, protocol.LANE_SEEDS)
 
 
 def kind_of_lane(c: Config, asked: str | None) -> str:
@@ -109,7 +110,7 @@ def kind_of_lane(c: Config, asked: str | None) -> str:
     return asked or ("stairs_up" if "stairs_up" in own or not own else own[0])
 
 
-def placed(c: Config, world: World, atlas: Atlas, command: float) -> World:
+def place_robots(c: Config, world: World, atlas: Atlas, command: float) -> World:
     """Return the world of trials on these lanes, to be walked at `command`, m/s forward.
 
     Raises:
@@ -117,14 +118,16 @@ def placed(c: Config, world: World, atlas: Atlas, command: float) -> World:
     """
     if not 0.0 < command < math.inf:
         raise ConfigError(f"--command must be above 0 m/s, not {command:g}")
-    trial = evaluation.trial_config(c)
+    trial = protocol.trial_config(c)
     trial = dataclasses.replace(
         trial, command=dataclasses.replace(trial.command, lane_vx=(command, command))
     )
     return make_world(trial, world.physics).replace(lanes=atlas)
 
 
-def in_turn(atlas: Atlas, count: int) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
+def round_robin_lanes(
+    atlas: Atlas, count: int
+) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
     """Return kind and level of the lane of each robot: kinds in turn, then their levels."""
     number = np.arange(count)
     return number % len(atlas.kinds), number // len(atlas.kinds) % atlas.levels
@@ -132,7 +135,7 @@ def in_turn(atlas: Atlas, count: int) -> tuple[Int[np.ndarray, " E"], Int[np.nda
 
 def begin(world: World, seed: int, count: int) -> rollout.Robots:
     """Return robots at the start of their lanes."""
-    return trials.begin(world, seed, np.arange(count), *in_turn(world.lanes, count))
+    return trials.begin(world, seed, np.arange(count), *round_robin_lanes(world.lanes, count))
 
 
 def name_of_lane(world: World, kind: str) -> str:
@@ -141,7 +144,7 @@ def name_of_lane(world: World, kind: str) -> str:
     return f"{kind}, {size:.0f} {'%' if kind == 'slope' else 'cm'}" if size else kind
 
 
-def crowd(asked: int | None, on_accelerator: int) -> int:
+def default_num_envs(asked: int | None, on_accelerator: int) -> int:
     """Return how many robots to watch: as many as asked for, or as the device does in a minute.
 
     Raises:
@@ -160,7 +163,7 @@ def steps_of(seconds: float, c: Config) -> int:
     Raises:
         ConfigError: the time is not above 0, or above a trial's.
     """
-    most = evaluation.TRIAL_SECONDS
+    most = protocol.TRIAL_SECONDS
     if not 0.0 < seconds <= most:
         raise ConfigError(f"--seconds must be above 0, up to {most:g}, not {seconds:g}")
     return max(1, round(seconds / c.physics.control_period))
@@ -223,7 +226,7 @@ def terrain_under(
     on the level ground of other lanes, but for the last `before` m before an obstacle.
     """
     names = np.full(x.shape, "", dtype="U16")
-    for e, (kind, level) in enumerate(zip(*in_turn(atlas, x.shape[1]), strict=True)):
+    for e, (kind, level) in enumerate(zip(*round_robin_lanes(atlas, x.shape[1]), strict=True)):
         names[:, e] = _on_lane(atlas.tile(level, kind), atlas.kinds[kind], x[:, e], before)
     return names
 

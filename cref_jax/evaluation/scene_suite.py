@@ -17,18 +17,21 @@ from typing import NamedTuple
 import numpy as np
 from rich.progress import track
 
-from cref_jax import deploy, evaluation, ood, ood_verdict, robot, sideways, stand_in
+from cref_jax import deploy, robot
 from cref_jax.config import Config
-from cref_jax.disturbance import UNDISTURBED, Disturbance
 from cref_jax.errors import ConfigError
-from cref_jax.evaluation import COMMANDS, TRIAL_SECONDS
+from cref_jax.evaluation import lateral_drift, protocol, scene_results
+from cref_jax.evaluation.protocol import COMMANDS, TRIAL_SECONDS
+from cref_jax.evaluation.scene_results import Condition, Outcome, Verdict
 from cref_jax.film import write_video
-from cref_jax.ood import Scene
-from cref_jax.ood_verdict import Condition, Outcome, Verdict
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
-from cref_jax.stand_in import StandIn, Start, Trial
 from cref_jax.system import parallel
+from cref_jax.whole_body import scene_files
+from cref_jax.whole_body.disturbances import UNDISTURBED, Disturbance
+from cref_jax.whole_body.scene_files import Scene
+from cref_jax.whole_body.simulator import WholeBodySim
+from cref_jax.whole_body.trial import Start, Trial, run_trial
 
 START_X, START_Y = (0.5, 1.0), (-0.3, 0.3)  # m; assumed: as in training
 START_YAW = (-0.2, 0.2)  # rad; assumed
@@ -59,7 +62,7 @@ class _Job(NamedTuple):
     condition: Condition
 
 
-def judge(
+def run_scenes(
     policy: Path | None = None,
     trials: int = 10,
     stress_trials: int = 2,
@@ -87,7 +90,7 @@ def judge(
             "trials must be at least 1, stress trials and seed at least 0, not "
             f"{trials}, {stress_trials} and {seed}"
         )
-    path, found = policy or sources.bundled_policy(), dict(scenes or ood.scenes())
+    path, found = policy or sources.bundled_policy(), dict(scenes or scene_files.scenes())
     arguments = (path, found, seed, seconds)
     _Runner(*arguments)  # refuses what is no policy before any process is started
     conditions = (GOOD, *(CONDITIONS if stress_trials else ()))
@@ -102,7 +105,7 @@ def judge(
     for job, outcome in zip(jobs, outcomes, strict=True):
         table[job.condition][job.scene].append(outcome)
     titles = {name: ground.title for name, ground in found.items()}
-    return ood_verdict.verdict(titles, table)
+    return scene_results.verdict(titles, table)
 
 
 def film(
@@ -121,11 +124,11 @@ def film(
     """
     if out.suffix != ".mp4":
         raise ConfigError(f"a film must end in .mp4: {out}")
-    ground = ood.named(name)
+    ground = scene_files.named(name)
     runner = _Runner(policy or sources.bundled_policy(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
     physics = runner.config.physics
-    spec = robot_scene.stage("all", physics, -ood.DITCH - robot_scene.BASE)
+    spec = robot_scene.stage("all", physics, -scene_files.DITCH - robot_scene.BASE)
     ground.add_to(spec, friction)
     stride = max(1, round(1.0 / (FRAME_RATE * physics.control_period)))
     points = robot_scene.camera_path(trial.qpos, physics.control_period)
@@ -136,7 +139,7 @@ def film(
     return trial
 
 
-def start(body: StandIn, name: str, seed: int, number: int) -> Start:
+def start(body: WholeBodySim, name: str, seed: int, number: int) -> Start:
     """Return how the trial of this number begins in the scene of this name."""
     rng = _rng(name, seed, number)
     x, y, yaw, speed = (
@@ -153,7 +156,7 @@ class _Runner:
     def __init__(self, path: Path, scenes: Mapping[str, Scene], seed: int, seconds: float) -> None:
         if sources.is_run(path):
             raise ConfigError(f"{path} is no exported policy; make one: python -m cref_jax.export")
-        self.config: Config = evaluation.evaluation_config(sources.read_config(path), seconds)
+        self.config: Config = protocol.evaluation_config(sources.read_config(path), seconds)
         self._contents = deploy.contents(path)
         self._scenes, self._seed, self._seconds = scenes, seed, seconds
         self._body = functools.cache(self._compiled)
@@ -165,7 +168,7 @@ class _Runner:
     def __call__(self, job: _Job) -> Outcome:
         """Return what a trial is counted by."""
         t = self.trial(job)
-        drift, aside = sideways.spans(t.qpos[:, 1:2])
+        drift, aside = lateral_drift.spans(t.qpos[:, 1:2])
         return Outcome(
             t.ending, t.seconds, t.progress, t.speed, t.status, float(drift[0]), float(aside[0])
         )
@@ -176,10 +179,10 @@ class _Runner:
         begun = start(body, job.scene, self._seed, job.number)
         fate = int(_rng(job.scene, self._seed, job.number, 1).integers(2**32))
         disturbance = job.condition.disturbance._replace(seed=fate)
-        return stand_in.run(body, self.policy(), begun, self._seconds, disturbance)
+        return run_trial(body, self.policy(), begun, self._seconds, disturbance)
 
-    def _compiled(self, name: str, friction: float) -> StandIn:
-        return StandIn(self.config, self._scenes[name], self.policy().joints.names, friction)
+    def _compiled(self, name: str, friction: float) -> WholeBodySim:
+        return WholeBodySim(self.config, self._scenes[name], self.policy().joints.names, friction)
 
 
 def _rng(name: str, seed: int, number: int, what: int = 0) -> np.random.Generator:

@@ -11,19 +11,20 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from cref_jax import config, evaluation, paper, ppo, proportion, sideways, table, trials
+from cref_jax import config, ppo
 from cref_jax.config import Config
 from cref_jax.env.state import Spread
 from cref_jax.env.world import World
+from cref_jax.evaluation import intervals, lateral_drift, paper_results, protocol, tables, trials
+from cref_jax.evaluation.trials import Trials
 from cref_jax.physics.simulation import Physics
-from cref_jax.trials import Trials
 
 EVERYTHING = "everything"
 PARTS = Spread._fields
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
-LEVELS = (*paper.LEVELS, BEYOND)
+LEVELS = (*paper_results.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs of that are not asked
-LANES = table.LANES | {"flat": ("flat",)}
+LANES = tables.LANES | {"flat": ("flat",)}
 ALONE = (("flat", "easy"), ("stairs", "medium"), ("gap", "medium"), ("platform", "medium"))
 
 
@@ -37,7 +38,11 @@ class Row(NamedTuple):
 
 def rows() -> list[Row]:
     """Return every row: the cells with everything, then each part alone on a cell of each kind."""
-    cells = [*paper.METHODS[paper.FULL].success, ("gap", BEYOND), ("platform", BEYOND)]
+    cells = [
+        *paper_results.METHODS[paper_results.FULL].success,
+        ("gap", BEYOND),
+        ("platform", BEYOND),
+    ]
     whole = [Row(EVERYTHING, *cell) for cell in cells]
     return whole + [Row(part, *cell) for part in PARTS for cell in ALONE]
 
@@ -46,17 +51,17 @@ def size(kind: str, level: str) -> float:
     """Return the size of the obstacles, m; 0 on flat ground."""
     if kind == "flat":
         return 0.0
-    return BEYOND_SIZES[kind] if level == BEYOND else table.sizes()[kind][level]
+    return BEYOND_SIZES[kind] if level == BEYOND else tables.cell_sizes()[kind][level]
 
 
 def world(c: Config, physics: Physics) -> World:
     """Return the world with the lanes of all rows and the project's own ranges of randomisation."""
     sized = {lane: [size(kind, at) for at in LEVELS] for kind, of in LANES.items() for lane in of}
-    w = table.world_of(c, physics, sized)
+    w = tables.world_of(c, physics, sized)
     return w.replace(config=dataclasses.replace(w.config, randomisation=config.Randomisation()))
 
 
-def judge(
+def run_rows(
     w: World,
     train: ppo.TrainState,
     count: int,
@@ -67,7 +72,7 @@ def judge(
     """Return what a policy makes of `count` trials of each row; `ended` is told of each end."""
     every = list(asked or rows())
     on = [
-        table.in_turn(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
+        tables.round_robin_lanes(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
         for row in every
     ]
     kind, level = map(np.concatenate, zip(*on, strict=True))
@@ -75,16 +80,18 @@ def judge(
     # the same start, command and draws on a lane, whatever is randomised there
     number = np.tile(np.arange(count), len(every))
     wanted = trials.Asked(number, kind, level, spread)
-    made = trials.run(w, trials.follow(train), wanted, seed, evaluation.block(), ended)
+    made = trials.run(w, trials.follow(train), wanted, seed, protocol.robots_per_block(), ended)
     part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in made))
     return [_outcome(row, part(k)) for k, row in enumerate(every)]
 
 
 def overall(found: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Return the means of the paper's cells, with everything randomised."""
-    cells = [row for row in found if row["part"] == EVERYTHING and row["level"] in paper.LEVELS]
-    rate = lambda some: proportion.mean(
-        [proportion.wilson(row["successes"], row["trials"]) for row in some]
+    cells = [
+        row for row in found if row["part"] == EVERYTHING and row["level"] in paper_results.LEVELS
+    ]
+    rate = lambda some: intervals.mean(
+        [intervals.wilson(row["successes"], row["trials"]) for row in some]
     )
     whole = rate(cells)
     return {
@@ -131,7 +138,7 @@ def _spread(part: str) -> Spread:
 
 
 def _outcome(row: Row, made: Trials) -> dict[str, Any]:
-    rate = proportion.wilson(int(made.succeeded.sum()), len(made.succeeded))
+    rate = intervals.wilson(int(made.succeeded.sum()), len(made.succeeded))
     return {
         **row._asdict(),
         "size_m": size(row.kind, row.level),
@@ -141,7 +148,7 @@ def _outcome(row: Row, made: Trials) -> dict[str, Any]:
         "wilson_low": rate.low,
         "wilson_high": rate.high,
         "failures": made.failures(),
-        "sideways": sideways.summed(made.drift, made.aside),
+        "sideways": lateral_drift.summarize(made.drift, made.aside),
     }
 
 

@@ -1,0 +1,1 @@
+"""Success rates, tables and suites of a trained policy."""

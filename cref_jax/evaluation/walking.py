@@ -1,0 +1,122 @@
+"""Episodes on flat ground, counted until each robot's first end."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cref_jax import ppo
+from cref_jax.config import Config
+from cref_jax.env.state import Ending
+from cref_jax.env.world import World, make_world
+from cref_jax.evaluation import lateral_drift, protocol, trials
+from cref_jax.evaluation.protocol import SECONDS
+from cref_jax.physics.simulation import Physics
+from cref_jax.training import rollout
+
+
+class Walk(NamedTuple):
+    """The outcome of E episodes."""
+
+    episodes: int
+    fell: int
+    by_cause: dict[str, int]
+    speed_error: float  # m/s, |commanded - walked| forward, mean over episodes
+    tracking_error: float  # m/s, of the planar velocity at each step
+    airborne: tuple[float, float]  # share of time that the left and the right foot are off ground
+    step_seconds: float  # mean time between two touchdowns of one foot
+    sideways: dict[str, float]  # m, see sideways.summed
+
+    def line(self) -> str:
+        """Return the outcome in one line for people."""
+        left, right = self.airborne
+        return (
+            f"{self.episodes - self.fell} of {self.episodes} episodes without a fall, "
+            f"speed error {self.speed_error:.3f} m/s, "
+            f"feet off the ground {left:.0%} and {right:.0%} of the time, "
+            f"{self.step_seconds:.2f} s a stride"
+        )
+
+
+class _Step(NamedTuple):
+    """What one step of an episode adds to its sums."""
+
+    alive: Bool[Array, " E"]
+    forward_speed: Float[Array, " E"]
+    forward_error: Float[Array, " E"]
+    tracking_error: Float[Array, " E"]
+    airborne: Bool[Array, "E F"]
+    y: Float[Array, " E"]  # m, before the step
+
+
+def walk(
+    c: Config, physics: Physics, train: ppo.TrainState, episodes: int = 100, seed: int = 0
+) -> Walk:
+    """Return how the policy's mean action does on the flat lane, without noise or pushes."""
+    flat = dataclasses.replace(c.terrain, name="flat")
+    world = make_world(protocol.evaluation_config(dataclasses.replace(c, terrain=flat)), physics)
+    steps = round(SECONDS / c.physics.control_period)
+    key = jax.random.key(trials.SEED + seed)
+    ending, trace = _episodes(world, train, key, episodes, steps)
+    return _summarize(jax.tree.map(np.asarray, ending), jax.tree.map(np.asarray, trace), c)
+
+
+@jax.jit(static_argnames=("episodes", "steps"))
+def _episodes(
+    world: World, train: ppo.TrainState, key: PRNGKeyArray, episodes: int, steps: int
+) -> tuple[Ending, _Step]:
+    """Return each robot's first end, and its steps [T, E] up to there."""
+    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+    robots = rollout.start(world, key, episodes)
+    robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
+
+    def step(
+        carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
+    ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _Step]]:
+        before, alive = carry
+        memory, policy = rollout.policy_step(nets, train, before)
+        robots, outcome = rollout.env_step(world, before, memory, policy.mean[0])
+        measures, ending = outcome.measures, outcome.ending
+        counted = Ending(*(flag & alive for flag in ending))
+        seen = _Step(
+            alive=alive,
+            forward_speed=measures.forward_speed,
+            forward_error=measures.forward_command - measures.forward_speed,
+            tracking_error=measures.speed_error,
+            airborne=measures.airborne,
+            y=before.env.body.qpos[:, 1],
+        )
+        return (robots, alive & ~ending.terminated & ~ending.truncated), (counted, seen)
+
+    first = (robots, jnp.ones(episodes, bool))
+    _, (endings, trace) = jax.lax.scan(step, first, None, length=steps)
+    return Ending(*(flag.any(axis=0) for flag in endings)), trace
+
+
+def _by_cause(ending: Ending) -> dict[str, int]:
+    """Return how many robots fell in each way; one that did in several counts for the first."""
+    flags = np.stack([getattr(ending, name) for name in trials.FALLS])
+    first = np.where(flags.any(axis=0), flags.argmax(axis=0), -1)
+    return {name: int((first == k).sum()) for k, name in enumerate(trials.FALLS)}
+
+
+def _summarize(ending: Ending, trace: _Step, c: Config) -> Walk:
+    alive, lived = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
+    of_episode = lambda x: np.sum(x * alive, axis=0) / lived
+    both = trace.alive[..., None]
+    airborne = np.sum(trace.airborne * both, axis=(0, 1)) / np.maximum(alive.sum(), 1)
+    touchdowns = (trace.airborne[:-1] & ~trace.airborne[1:] & both[1:]).sum()
+    seconds = 2 * alive.sum() * c.physics.control_period  # of foot and robot
+    return Walk(
+        episodes=alive.shape[1],
+        fell=int(ending.terminated.sum()),
+        by_cause=_by_cause(ending),
+        speed_error=float(np.abs(of_episode(trace.forward_error)).mean()),
+        tracking_error=float(of_episode(trace.tracking_error).mean()),
+        airborne=(float(airborne[0]), float(airborne[1])),
+        step_seconds=float(seconds / max(touchdowns, 1)),
+        sideways=lateral_drift.summarize(*lateral_drift.spans(trace.y, alive)),
+    )

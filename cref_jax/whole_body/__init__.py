@@ -1,0 +1,1 @@
+"""The whole robot in MuJoCo C on real boxes, without JAX."""

@@ -1,0 +1,116 @@
+"""The robot's stand-in: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
+
+It knows nothing of the training simulation: the ground is solids and not tangent planes, depth
+comes from MuJoCo's own ray-cast, the upper body is held by its motors, and the policy is run by
+deploy.py on what a robot measures. Nothing of JAX is in its loop.
+"""
+
+import math
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from cref_jax import config, robot
+from cref_jax.config import Config
+from cref_jax.whole_body.ground import GROUND, SEEN, UNSEEN, Ground
+
+FAR = 1e3  # m, a ray that meets nothing
+
+
+class WholeBodySim:
+    """The compiled model of robot and ground, and where things are in it."""
+
+    def __init__(
+        self,
+        c: Config,
+        ground: Ground,
+        joints: tuple[str, ...],
+        friction: float = robot.FRICTION,
+    ) -> None:
+        """Compile the model.
+
+        Args:
+            c: settings of physics, camera and episodes.
+            ground: what to walk on.
+            joints: those that the policy drives, in its order.
+            friction: coefficient that acts between robot and ground. MuJoCo takes the larger one
+                of two geoms, so that both have it.
+
+        Raises:
+            ConfigError: the ground needs too many boxes.
+        """
+        self.config, self.ground = c, ground
+        self.robot = robot.load(config.Robot(actuated="all"))
+        self.model = model = _spec(c, ground, self.robot, friction).compile()
+        names = self.robot.joint_names
+        self.driven = np.array([names.index(name) for name in joints])
+        self.feet = [model.body(f"{side}_ankle_roll_link").id for side in ("left", "right")]
+        self.rays = _rays(c.camera)
+        clear = np.array(self.robot.capsules.names)[self.robot.capsules.kept_clear]
+        self.kept_clear = {model.geom(name).id for name in clear}
+
+    def image(self, state: mujoco.MjData) -> Float[np.ndarray, "H W"]:
+        """Return z-depth in metres by ray-cast, infinity where a ray meets nothing."""
+        mount, camera = self.robot.camera, self.config.camera
+        link = state.xmat[mount.body].reshape(3, 3)
+        fixed = np.zeros(9)
+        mujoco.mju_quat2Mat(fixed, mount.rotation.astype(float))
+        pitch = math.radians(camera.pitch)
+        c, s = math.cos(pitch), math.sin(pitch)
+        axes = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])  # right, down, forward
+        position = state.xpos[mount.body] + link @ mount.position
+        world = self.rays @ (link @ fixed.reshape(3, 3) @ axes).T
+        count = len(world)
+        found, distance = np.zeros(count, np.int32), np.zeros(count)
+        groups = np.array([g in (GROUND, SEEN) for g in range(6)], np.uint8)
+        mujoco.mj_multiRay(
+            self.model, state, position, world.ravel(), groups, True, -1, found, distance,
+            None, count, FAR,
+        )  # fmt: skip
+        depth = np.where(distance < 0.0, np.inf, distance * self.rays[:, 2])
+        return depth.reshape(camera.shape).astype(np.float32)
+
+    def advance(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
+        """Advance one control step; return the mean force on each foot, N, as in training."""
+        substeps, force = self.config.physics.substeps, np.zeros((2, 3))
+        for _ in range(substeps):
+            mujoco.mj_step(self.model, state)
+            force += self.foot_force(state) / substeps
+        mujoco.mj_forward(self.model, state)  # poses and contacts of this moment, not of the last
+        return force
+
+    def foot_force(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
+        """Return the force of the ground on each foot at the last evaluation, N."""
+        return -state.sensordata.reshape(2, 3)
+
+    def is_hit(self, state: mujoco.MjData) -> bool:
+        """Return whether a part that is kept clear has come down."""
+        return not self.kept_clear.isdisjoint(state.contact.geom.ravel())
+
+
+def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors through the pixels' middles: right, down, forward."""
+    rows, columns = camera.shape
+    down, right = (math.tan(math.radians(0.5 * angle)) for angle in camera.view)
+    at = lambda n, reach: reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
+    y, x = np.meshgrid(at(rows, down), at(columns, right), indexing="ij")
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> mujoco.MjSpec:
+    """Return robot and ground; rays meet the ground and the links that training renders."""
+    spec = robot.spec("all", c.physics, contact_planes=0, visual=True)
+    capsules = whole.capsules
+    in_view = {n for n, yes in zip(capsules.names, capsules.in_view, strict=True) if yes}
+    clear = {n for n, yes in zip(capsules.names, capsules.kept_clear, strict=True) if yes}
+    solid = set(capsules.names) if ground.stops_every_link else clear
+    for geom in spec.geoms:
+        touches = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE
+        geom.group = SEEN if geom.name in in_view else UNSEEN
+        geom.contype = int(touches or geom.name in solid)
+        geom.friction = [friction, 0.005, 0.0001]
+    ground.add_to(spec, friction)
+    robot.add_force_sensors(spec)
+    return spec
