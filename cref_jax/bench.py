@@ -21,12 +21,13 @@ from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import brax_peer, cli, config, peers, roofline, stages
+from cref_jax import cli, config
+from cref_jax.benchmarks import brax_peer, roofline, stages, warp_raycast
+from cref_jax.benchmarks.roofline import Rates
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World, build_world
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
-from cref_jax.roofline import Rates
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import lanes
 from cref_jax.training import devices, iteration, rollout
@@ -136,7 +137,7 @@ def _engine(
     if engine != "mujoco":
         return [whole, ours]
     substeps, threads = world.config.physics.substeps, parallel.cores()
-    alone = peers.raw_substep(
+    alone = warp_raycast.raw_substep(
         world.physics, robots.env.body, threads, stages.STEPS * substeps, options.repeats
     )
     raw = Row("physics, MuJoCo's own batch", count, alone * substeps, 0.0)
@@ -166,15 +167,15 @@ def _started(c: Config, engine: EngineName) -> tuple[World, iteration.RunState]:
     return world, jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
 
 
-def compare_depth(options: Options) -> list[peers.Speed]:
+def compare_depth(options: Options) -> list[warp_raycast.Speed]:
     """Return the speed of the depth camera and of NVIDIA Warp's ray-cast, on a flight of stairs."""
     c = config.override(Config(), {"terrain": {"name": "stairs"}})
     lane = lanes.single(c.terrain, "stairs_up", 0.15)
     with Console().status("depth: compiling and timing"):
-        return peers.compare(lane.tile(0, 0), c.camera, lane.is_profile[0])
+        return warp_raycast.compare(lane.tile(0, 0), c.camera, lane.is_profile[0])
 
 
-def show(options: Options, rates: Rates, rows: list[Row], speeds: list[peers.Speed]) -> None:
+def show(options: Options, rates: Rates, rows: list[Row], speeds: list[warp_raycast.Speed]) -> None:
     """Print the tables and the ratios that the design promises."""
     table = Table(title=f"{options.terrain}, {_machine()}")
     columns = (
@@ -225,7 +226,7 @@ def ratios(rows: list[Row]) -> dict[str, float]:
 
 
 def as_json(
-    options: Options, rates: Rates, rows: list[Row], speeds: list[peers.Speed]
+    options: Options, rates: Rates, rows: list[Row], speeds: list[warp_raycast.Speed]
 ) -> dict[str, Any]:
     """Return all figures with where they were measured."""
     return {
@@ -267,7 +268,7 @@ def _timed(
     program = jax.jit(shared(make, in_specs=(P(), part))).lower(world, state).compile()
     compiled = time.perf_counter() - begun
     run = lambda: jax.block_until_ready(program(world, state))
-    seconds = peers.shortest(run, options.repeats)
+    seconds = warp_raycast.shortest(run, options.repeats)
     return Row(stage, count, seconds / stages.STEPS, compiled, least / seconds)
 
 
@@ -284,7 +285,7 @@ def _iteration(options: Options, stage: str, c: Config) -> Row:
         run["state"], log = program(world, run["state"])
         return jax.block_until_ready(log)
 
-    seconds = peers.shortest(step, options.repeats)
+    seconds = warp_raycast.shortest(step, options.repeats)
     return Row(stage, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compiled)
 
 

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cref_jax import cli, evaluation_page
+from cref_jax import cli
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import (
@@ -29,6 +29,7 @@ from cref_jax.evaluation import (
     tables,
     walking,
 )
+from cref_jax.pages import evaluation_page
 from cref_jax.physics.records import EngineName
 from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.system import jax_setup, parallel

@@ -25,7 +25,8 @@ from jaxtyping import PyTree
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, depth, hlo
+from cref_jax import cli, depth
+from cref_jax.benchmarks import hlo
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError

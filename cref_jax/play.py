@@ -21,14 +21,14 @@ import tyro
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from rich.progress import track
 
-from cref_jax import cli, config, film, network, panel, ppo, robot
+from cref_jax import cli, config, network, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import footholds
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import protocol
 from cref_jax.policy import sources
-from cref_jax.rendering import robot_scene
+from cref_jax.rendering import policy_overlay, robot_scene, video
 from cref_jax.system import jax_setup
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
@@ -143,11 +143,11 @@ def play(options: Options) -> None:
         recording = record(world, train, options)
         if options.stills:
             moments = np.linspace(0, len(recording.qpos) - 1, options.stills).round().astype(int)
-            film.write_stills(out, _film(canvas, recording._replace(minds=None), moments, c))
+            video.write_stills(out, _film(canvas, recording._replace(minds=None), moments, c))
         else:
             stride = max(1, round(1.0 / (FRAME_RATE * period)))
             moments = np.arange(0, len(recording.qpos), stride)
-            film.write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
+            video.write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
     print(f"wrote {out}")
     print(summary(recording, options.command, period))
 
@@ -285,13 +285,15 @@ def _film(
         if minds is None:
             yield world
             continue
-        upto = max(0, t + 1 - round(panel.SECONDS / period))
-        mind = panel.Mind(
+        upto = max(0, t + 1 - round(policy_overlay.SECONDS / period))
+        mind = policy_overlay.Mind(
             depth=minds.depth[t] if minds.depth is not None and minds.seen[t] else None,
             attention=None if minds.attention is None else minds.attention[t],
             gates=np.asarray(minds.gate[upto : t + 1]),
         )
-        side = panel.draw(mind, HEIGHT, c.camera.d_max, period, sees=minds.depth is not None)
+        side = policy_overlay.draw(
+            mind, HEIGHT, c.camera.d_max, period, sees=minds.depth is not None
+        )
         yield np.concatenate([world, side], axis=1)
 
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import tyro
 
-from cref_jax import cli, deploy, page, run_page
+from cref_jax import cli, deploy
 from cref_jax.errors import ConfigError
-from cref_jax.page import Column, Html, Section, code, join
+from cref_jax.pages import markup, run_page
+from cref_jax.pages.markup import Column, Html, Section, code, join
 from cref_jax.policy import sources
 
 
@@ -33,14 +34,14 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.report")
     with cli.one_line_errors(options.debug):
         if options.out:
-            page.check_name(options.out)
+            markup.check_name(options.out)
         source = sources.resolve_policy(options.run, options.policy)
         if options.policy or (options.run is None and not sources.is_run(source)):
             out, document = options.out or Path("policy.html"), _policy_document(source)
         else:
             out = options.out or source / "report.html"
             document = run_page.document(run_page.read(source))
-        page.write(out, document)
+        markup.write(out, document)
         print(f"wrote {out}, {out.stat().st_size / 1000:,.0f} kB; open it in any browser")
 
 
@@ -63,16 +64,16 @@ def _policy_document(path: Path) -> str:
         Section("Settings", run_page.settings(origin["config"])),
         Section("Evaluation", run_page.evaluation(record, "manifest.json"))
         if record
-        else Section("Evaluation", page.note("None was there when it was exported.")),
+        else Section("Evaluation", markup.note("None was there when it was exported.")),
     ]
-    lead = page.tiles(
+    lead = markup.tiles(
         [
             (f"{origin['iteration']:,}", "iterations"),
             (f"{origin['samples'] / 1e6:.1f} M", "samples"),
             (content["network"]["variant"], "network"),
         ]
     )
-    return page.document(f"Policy {path.resolve().name}", lead, sections, run_page.foot())
+    return markup.document(f"Policy {path.resolve().name}", lead, sections, run_page.foot())
 
 
 def _overview(content: dict[str, Any], path: Path) -> Html:
@@ -80,7 +81,7 @@ def _overview(content: dict[str, Any], path: Path) -> Html:
     origin, rates, command = content["provenance"], content["rates"], content["command"]
     ends = zip(command["low"], command["high"], strict=True)
     limits = [f"{low:g} to {high:g}" for low, high in ends]
-    return page.pairs(
+    return markup.pairs(
         [
             ("folder", code(str(path))),
             ("run", str(origin["run"])),
@@ -107,12 +108,14 @@ def _joints(content: dict[str, Any]) -> Html:
         "effort, N m",
     )
     columns = [Column("joint"), *(Column(title, True) for title in titles)]
-    number = lambda joint, key: f"{joint[key]:.4g}" if key in joint else page.MISSING
+    number = lambda joint, key: f"{joint[key]:.4g}" if key in joint else markup.MISSING
     rows = lambda joints: [(j["name"], *(number(j, key) for key in keys)) for j in joints]
     driven, held = content["joints"], content["held_joints"]
     return join(
-        page.folded(f"{len(driven)} joints that it drives", page.table(columns, rows(driven))),
-        page.folded(f"{len(held)} joints that the robot holds", page.table(columns, rows(held))),
+        markup.folded(f"{len(driven)} joints that it drives", markup.table(columns, rows(driven))),
+        markup.folded(
+            f"{len(held)} joints that the robot holds", markup.table(columns, rows(held))
+        ),
     )
 
 

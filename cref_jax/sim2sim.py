@@ -14,7 +14,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cref_jax import cli, deploy, film
+from cref_jax import cli, deploy
 from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
@@ -24,7 +24,7 @@ from cref_jax.evaluation.protocol import TRIAL_SECONDS
 from cref_jax.physics.simulation import Physics
 from cref_jax.policy import reader, sources
 from cref_jax.policy.trained import TrainedPolicy
-from cref_jax.rendering import robot_scene
+from cref_jax.rendering import robot_scene, video
 from cref_jax.system import jax_setup, parallel
 from cref_jax.whole_body.disturbances import Disturbance
 from cref_jax.whole_body.ground import Lane
@@ -194,7 +194,7 @@ def _film(out: Path, world: World, trial: Trial) -> None:
         robot_scene.build("all", c.physics, world.lanes.tile(0, 0)), *SIZE
     ) as canvas:
         frames = (canvas.draw(trial.qpos[t], points[t]) for t in track(moments, "drawing"))
-        film.write_video(out, frames, 1.0 / (stride * period))
+        video.write_video(out, frames, 1.0 / (stride * period))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from cref_jax import curves
+from cref_jax.pages import training_log
 
 TITLES = {
     "episode/length_s": "episode length, s",
@@ -48,11 +48,11 @@ def main() -> None:
     figure, axes = plt.subplots(1, len(options.show), figsize=size, constrained_layout=True)
     axes = np.atleast_1d(axes)
     for run in options.runs:
-        log = curves.read(run / "log.jsonl")
+        log = training_log.read(run / "log.jsonl")
         millions = log["train/samples"] / 1e6
         over = log.minutes() if options.over == "minutes" else millions
         for axis, name in zip(axes, options.show, strict=True):
-            mean = curves.smooth(log, name, options.smooth)
+            mean = training_log.smooth(log, name, options.smooth)
             whole = slice(options.smooth - 1, None)
             axis.plot(over[whole], mean[whole], label=f"{run.name}, {millions[-1]:.1f} M")
     for axis, name in zip(axes, options.show, strict=True):

@@ -7,9 +7,9 @@ depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
 from dataclasses import dataclass
 from pathlib import Path
 
-from cref_jax import config, film, robot
+from cref_jax import config, robot
 from cref_jax.config import Config
-from cref_jax.rendering import robot_scene
+from cref_jax.rendering import robot_scene, video
 from cref_jax.whole_body import ground, scene_files
 from cref_jax.whole_body.simulator import WholeBodySim
 
@@ -82,7 +82,7 @@ def main() -> None:
     print(f"wrote {options.out}")
 
 
-def view(c: Config, ground: scene_files.Scene, x: float) -> tuple[film.Frame, np.ndarray]:
+def view(c: Config, ground: scene_files.Scene, x: float) -> tuple[video.Frame, np.ndarray]:
     """Return a picture of the robot at x and its depth image, m, d_max where nothing is seen."""
     body = WholeBodySim(c, ground, robot.load(config.Robot(actuated="all")).joint_names)
     state = mujoco.MjData(body.model)

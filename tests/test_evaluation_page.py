@@ -8,8 +8,8 @@ import pytest
 import records
 from reading import leaves, read
 
-from cref_jax import evaluation_page, outcomes
 from cref_jax.errors import ConfigError
+from cref_jax.pages import evaluation_charts, evaluation_page
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 
@@ -183,9 +183,9 @@ def test_names_with_markup_or_formulas_are_shown_as_they_are(tmp_path):
 
 
 def test_a_cause_that_is_new_has_its_own_name():
-    failures = [outcomes.Failures("gap", 10, {"struck by lightning": 2})]
-    assert "<img" in outcomes.failure_chart(failures)
-    assert outcomes.called("struck by lightning") == "struck by lightning"
+    failures = [evaluation_charts.Failures("gap", 10, {"struck by lightning": 2})]
+    assert "<img" in evaluation_charts.failure_chart(failures)
+    assert evaluation_charts.display_name("struck by lightning") == "struck by lightning"
 
 
 @pytest.mark.slow

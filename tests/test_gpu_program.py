@@ -4,7 +4,8 @@ import importlib.util
 
 import pytest
 
-from cref_jax import gpu_program, hlo
+from cref_jax import gpu_program
+from cref_jax.benchmarks import hlo
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 

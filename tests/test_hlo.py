@@ -2,7 +2,7 @@
 
 import pytest
 
-from cref_jax import hlo
+from cref_jax.benchmarks import hlo
 
 # a loop of five turns and one of an unknown number, a fusion with a product, one that reads a slice
 TEXT = """\

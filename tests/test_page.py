@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from reading import Page, leaves, read
 
-from cref_jax import page
 from cref_jax.errors import ConfigError
-from cref_jax.page import Column, Section
+from cref_jax.pages import markup
+from cref_jax.pages.markup import Column, Section
 
 EVIL = """<script>alert("1")</script>&amp;'"><img src=x onerror=alert(1)>"""
 
@@ -20,26 +20,26 @@ def line(axis):
 
 
 def whole(*parts):
-    return page.document("a title", page.Html(), [Section("a part", page.join(*parts))])
+    return markup.document("a title", markup.Html(), [Section("a part", markup.join(*parts))])
 
 
 def test_text_never_becomes_markup_wherever_it_stands():
     parts = {
-        "paragraph": page.paragraph(EVIL),
-        "code": page.code(EVIL),
-        "note": page.note("see ", EVIL),
-        "tile": page.tiles([(EVIL, EVIL)]),
-        "pair": page.pairs([(EVIL, EVIL)]),
-        "table": page.table([Column(EVIL), Column(EVIL, True)], [(EVIL, EVIL)], EVIL),
-        "folded": page.folded(EVIL, EVIL),
-        "attribute": page.element("p", "x", title=EVIL),
-        "nested": page.nested([Section(EVIL, page.paragraph("x"))]),
+        "paragraph": markup.paragraph(EVIL),
+        "code": markup.code(EVIL),
+        "note": markup.note("see ", EVIL),
+        "tile": markup.tiles([(EVIL, EVIL)]),
+        "pair": markup.pairs([(EVIL, EVIL)]),
+        "table": markup.table([Column(EVIL), Column(EVIL, True)], [(EVIL, EVIL)], EVIL),
+        "folded": markup.folded(EVIL, EVIL),
+        "attribute": markup.element("p", "x", title=EVIL),
+        "nested": markup.nested([Section(EVIL, markup.paragraph("x"))]),
     }
     for name, part in parts.items():
         seen = Page(whole(part))
         assert not {"script", "img"} & set(seen.tags), name
         assert EVIL in seen.text or name == "attribute"
-    seen = Page(page.document(EVIL, page.escaped(EVIL), [Section(EVIL, page.Html())], EVIL))
+    seen = Page(markup.document(EVIL, markup.escaped(EVIL), [Section(EVIL, markup.Html())], EVIL))
     assert seen.text.count(EVIL) == 6  # title, heading, lead, link, section, foot
     assert not {"script", "img"} & set(seen.tags)
 
@@ -47,18 +47,18 @@ def test_text_never_becomes_markup_wherever_it_stands():
 def test_what_a_chart_or_a_file_is_called_never_becomes_markup(tmp_path):
     path = tmp_path / "<b>'\"&.png"
     Image.new("RGB", (2, 2)).save(path)
-    seen = Page(whole(page.chart(line, EVIL, EVIL), page.media(path)))
+    seen = Page(whole(markup.chart(line, EVIL, EVIL), markup.media(path)))
     assert seen.tags.count("img") == 2 and not {"script", "b"} & set(seen.tags)
     assert EVIL in seen.text and path.name in seen.text
 
 
 def test_a_file_name_that_is_no_unicode_can_be_shown(tmp_path):
-    page.write(tmp_path / "a.html", whole(page.code(os.fsdecode(b"run-\xff"))))
+    markup.write(tmp_path / "a.html", whole(markup.code(os.fsdecode(b"run-\xff"))))
     assert "run-?" in read(tmp_path / "a.html").text
 
 
 def test_no_reference_leaves_the_page_and_a_browser_is_told_so():
-    text = whole(page.chart(line, "a line"), page.paragraph("x"))
+    text = whole(markup.chart(line, "a line"), markup.paragraph("x"))
     seen = Page(text)
     assert leaves(seen) == [] and seen.alone == []
     assert not re.search(r"https?://", text)
@@ -70,13 +70,13 @@ def svg(drawn):
 
 
 def test_equal_charts_are_equal_bytes_and_their_letters_need_no_font():
-    assert page.chart(line, "x") == page.chart(line, "x")
-    assert "<text" not in svg(page.chart(line, "x"))
+    assert markup.chart(line, "x") == markup.chart(line, "x")
+    assert "<text" not in svg(markup.chart(line, "x"))
 
 
 def test_rounding_keeps_every_point_and_the_scale_of_letters():
     # three points, with at most two digits behind the point; letters are scaled by 1/64
-    drawn = svg(page.chart(line, "x"))
+    drawn = svg(markup.chart(line, "x"))
     curve = next(d for d in re.findall(r'd="([^"]+)"', drawn) if d.count("L ") == 2)
     assert not re.search(r"\.\d{3}", curve)
     assert "scale(0.015625)" in drawn
@@ -85,37 +85,37 @@ def test_rounding_keeps_every_point_and_the_scale_of_letters():
 def test_a_picture_is_in_the_page_bit_for_bit(tmp_path):
     path = tmp_path / "a.png"
     Image.effect_noise((64, 48), 50.0).save(path)
-    inside = re.search(r"data:image/png;base64,([^\"]+)", page.media(path))[1]
+    inside = re.search(r"data:image/png;base64,([^\"]+)", markup.media(path))[1]
     assert base64.b64decode(inside) == path.read_bytes()
 
 
 def test_a_film_is_in_the_page_or_named_where_it_is_too_large(tmp_path):
     path = tmp_path / "play.mp4"
     path.write_bytes(b"\0\0\0\x20ftypisom" + bytes(5_000_000))
-    assert "<video" in page.media(path)
-    note = page.media(path, most=4_000_000)
+    assert "<video" in markup.media(path)
+    note = markup.media(path, most=4_000_000)
     assert "<video" not in note and "play.mp4" in note and "(5.0 MB) is left out" in note
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.mp4"])
 def test_a_file_that_is_not_what_its_name_says_is_a_note(tmp_path, name):
     (tmp_path / name).write_bytes(b"<svg onload=alert(1)>")
-    assert f"is no {name[2:]} file" in Page(page.media(tmp_path / name)).text
-    assert "cannot be read" in page.media(tmp_path / f"b{name[1:]}")
+    assert f"is no {name[2:]} file" in Page(markup.media(tmp_path / name)).text
+    assert "cannot be read" in markup.media(tmp_path / f"b{name[1:]}")
 
 
 def test_a_row_with_a_cell_too_few_is_refused():
     with pytest.raises(ValueError):
-        page.table([Column("a"), Column("b")], [("1",)])
+        markup.table([Column("a"), Column("b")], [("1",)])
 
 
 def test_a_page_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path):
     with pytest.raises(ConfigError, match=r"ends in \.html, and .*a\.pdf does not"):
-        page.write(tmp_path / "a.pdf", "x")
+        markup.write(tmp_path / "a.pdf", "x")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write"):
-        page.write(tmp_path / "file" / "a.html", "x")
+        markup.write(tmp_path / "file" / "a.html", "x")
     (tmp_path / "b.html").mkdir()
     with pytest.raises(ConfigError, match="cannot write"):
-        page.write(tmp_path / "b.html", "x")
+        markup.write(tmp_path / "b.html", "x")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b.html", "file"]

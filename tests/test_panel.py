@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from cref_jax import panel
-from cref_jax.panel import Mind
+from cref_jax.rendering import policy_overlay
+from cref_jax.rendering.policy_overlay import Mind
 
 PERIOD = 0.02  # s
 HEIGHT = 540
 
 
 def drawn(mind, sees=True):
-    return panel.draw(mind, HEIGHT, d_max=3.0, period=PERIOD, sees=sees)
+    return policy_overlay.draw(mind, HEIGHT, d_max=3.0, period=PERIOD, sees=sees)
 
 
 def some_mind(**changes):
@@ -21,7 +21,7 @@ def some_mind(**changes):
 
 def test_it_has_the_height_of_the_picture_beside_it():
     for sees in (True, False):
-        assert drawn(some_mind(), sees).shape == (HEIGHT, panel.WIDTH, 3)
+        assert drawn(some_mind(), sees).shape == (HEIGHT, policy_overlay.WIDTH, 3)
     assert drawn(some_mind()).dtype == np.uint8
 
 
@@ -29,7 +29,7 @@ def test_near_is_red_and_far_is_blue():
     depth = np.full((48, 64), 0.5)  # d_max
     depth[:, :32] = -0.4  # 0.3 m
     image = drawn(some_mind(depth=depth)).astype(int)
-    row = image[150, panel.MARGIN + 5 : panel.WIDTH - panel.MARGIN - 5]
+    row = image[150, policy_overlay.MARGIN + 5 : policy_overlay.WIDTH - policy_overlay.MARGIN - 5]
     near, far = row[20], row[-20]
     assert near[0] > 2 * near[2] and far[2] > far[0]
 
@@ -52,4 +52,4 @@ def test_each_part_shows_what_it_is_given():
 
 def test_before_the_first_frame_it_is_grey_and_does_not_fail():
     image = drawn(Mind(None, None, np.full((1, 16), 0.5)))
-    assert (image[100, 100] == panel.FAINT).all()
+    assert (image[100, 100] == policy_overlay.FAINT).all()

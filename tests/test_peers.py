@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, peers, terrain
+from cref_jax import config, terrain
+from cref_jax.benchmarks import warp_raycast
 
 STEP = np.repeat([[0.0], [0.0], [0.2], [0.2]], 3, axis=1)  # m, up by 20 cm half way
 
@@ -18,7 +19,7 @@ def area(mesh, normal):
 
 
 def test_boxes_have_vertical_risers_and_level_treads():
-    mesh = peers.box_mesh(STEP, np.zeros(2), 0.1)
+    mesh = warp_raycast.box_mesh(STEP, np.zeros(2), 0.1)
     # two boxes of 20 x 30 cm: top and bottom of each, 4 x 0.06 m^2
     np.testing.assert_allclose(area(mesh, (0, 0, 1)), 0.24, atol=1e-6)
     # fronts and backs, 30 cm wide, from 0.1 m under the ground: 2 x 0.3 x (0.1 + 0.3)
@@ -27,18 +28,18 @@ def test_boxes_have_vertical_risers_and_level_treads():
 
 
 def test_a_grid_has_two_triangles_between_four_columns():
-    mesh = peers.grid_mesh(STEP, np.zeros(2), 0.1)
+    mesh = warp_raycast.grid_mesh(STEP, np.zeros(2), 0.1)
     assert len(mesh.points) == 12 and len(mesh.triangles) == 3 * 2 * 2
     # level parts: between the first two rows of columns and the last two, 0.1 x 0.2 m^2 each
     np.testing.assert_allclose(area(mesh, (0, 0, 1)), 0.04, atol=1e-6)
 
 
 def test_our_renderers_are_compared_on_the_same_image(monkeypatch):
-    monkeypatch.setattr(peers, "CAMERAS", 4)
-    monkeypatch.setattr(peers, "REPEATS", 1)
-    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(warp_raycast, "CAMERAS", 4)
+    monkeypatch.setattr(warp_raycast, "REPEATS", 1)
+    monkeypatch.setattr(warp_raycast.importlib.util, "find_spec", lambda name: None)
     heights = np.repeat(np.floor(np.arange(200) / 15)[:, None] * 0.15, 60, axis=1)
     ground = terrain.from_heights(jnp.asarray(heights), 0.02, (0.0, -0.6))
-    march, sweep, cast = peers.compare(ground, config.Camera(), is_profile=True)
+    march, sweep, cast = warp_raycast.compare(ground, config.Camera(), is_profile=True)
     assert march.agreement == 1.0 and sweep.agreement > 0.999 and cast.agreement > 0.99
     assert march.frames_per_second > 0 and sweep.threads == "all"

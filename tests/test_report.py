@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from PIL import Image
 from reading import leaves, read
 
-from cref_jax import config, curves, learning_charts, report, run_page
+from cref_jax import config, report
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
+from cref_jax.pages import learning_charts, run_page, training_log
 from cref_jax.policy import sources
 from cref_jax.training import run_dir
 
@@ -213,7 +214,7 @@ def test_a_start_says_how_many_iterations_are_done(tmp_path):
 
 def test_a_line_that_a_power_cut_damaged_is_skipped_and_counted(run):
     write_log(run / "log.jsonl", [row(i) for i in range(1, 21)], '{"iteration": 21, "samp')
-    log = curves.read(run / "log.jsonl")
+    log = training_log.read(run / "log.jsonl")
     assert (log["iteration"][-1], log.damaged) == (20, 1)
     seen = shown(run)
     assert "1 line of the log could not be read" in seen.text
@@ -223,7 +224,7 @@ def test_a_line_that_a_power_cut_damaged_is_skipped_and_counted(run):
 def test_a_line_that_is_no_iteration_is_skipped(tmp_path, line):
     path = tmp_path / "log.jsonl"
     path.write_text(f"{json.dumps(row(1))}\n{line}\n{json.dumps(row(2))}\n")
-    log = curves.read(path)
+    log = training_log.read(path)
     assert list(log["iteration"]) == [1, 2] and log.damaged == 1
 
 
@@ -232,7 +233,7 @@ def test_iterations_that_were_trained_again_count_once(tmp_path):
     path = tmp_path / "log.jsonl"
     order = [1, 2, 3, 4, 3, 4, 5, 4, 5, 6]
     write_log(path, [row(i, **{"walk/reward": float(k)}) for k, i in enumerate(order)])
-    log = curves.read(path)
+    log = training_log.read(path)
     assert list(log["iteration"]) == [1, 2, 3, 4, 5, 6]
     assert list(log["walk/reward"]) == [0, 1, 4, 7, 8, 9]
     assert log.repeated == (3, 4)
@@ -242,7 +243,7 @@ def test_columns_that_come_late_or_go_early_and_null_are_not_numbers(tmp_path):
     path = tmp_path / "log.jsonl"
     a, b, c = row(1, early=1.0), row(2, **{"loss/kl": None}), row(3, late=2.0)
     write_log(path, [a, b, c])
-    log = curves.read(path)
+    log = training_log.read(path)
     assert np.isnan(log["loss/kl"]).tolist() == [False, True, False]
     assert np.isnan(log["late"]).tolist() == [True, True, False]
     assert np.isnan(log["early"]).tolist() == [False, True, True]
@@ -250,15 +251,15 @@ def test_columns_that_come_late_or_go_early_and_null_are_not_numbers(tmp_path):
 
 def test_a_log_without_a_line_or_a_file_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="cannot read"):
-        curves.read(tmp_path / "log.jsonl")
+        training_log.read(tmp_path / "log.jsonl")
     (tmp_path / "log.jsonl").write_text('{"iter')
     with pytest.raises(ConfigError, match="has no whole line"):
-        curves.read(tmp_path / "log.jsonl")
+        training_log.read(tmp_path / "log.jsonl")
 
 
 @given(count=st.integers(1, 5000), most=st.integers(2, 700))
 def test_thinning_keeps_the_ends_and_its_limit(count, most):
-    at = curves.thinned(count, most)
+    at = training_log.thinned(count, most)
     assert at[0] == 0 and at[-1] == count - 1
     assert len(at) == min(count, most) and (np.diff(at) > 0).all()
     assert len(at) < 2 or np.diff(at).max() - np.diff(at).min() <= 1
@@ -273,8 +274,10 @@ def test_smoothing_is_the_mean_of_what_is_known_weighted_by_episodes(values, end
     count = len(values)
     columns = {"walk/reward": np.array(values), "episode/length_s": np.array(values)}
     columns["episode/ended"] = np.array(ended[:count], float)
-    log = curves.Log(columns, (), 0)
-    plain, weighted = (curves.smooth(log, n, window) for n in ("walk/reward", "episode/length_s"))
+    log = training_log.Log(columns, (), 0)
+    plain, weighted = (
+        training_log.smooth(log, n, window) for n in ("walk/reward", "episode/length_s")
+    )
     for k in range(count):
         known = [i for i in range(max(0, k - window + 1), k + 1) if not math.isnan(values[i])]
         mean = np.mean([values[i] for i in known]) if known else math.nan
@@ -306,7 +309,7 @@ def test_a_long_log_does_not_make_a_large_page(tmp_path):
         values = {"loss/kl": rng.random(count), "loss/value": rng.random(count)}
         rows = ({k: float(v[i]) for k, v in values.items()} for i in range(count))
         write_log(path, (row(i + 1, **new) for i, new in enumerate(rows)))
-        sections = learning_charts.sections(curves.read(path), (), None, 1)
+        sections = learning_charts.sections(training_log.read(path), (), None, 1)
         return sum(len(section.body) for section in sections)
 
     assert size(20_000) < 1.1 * size(2_000)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from cref_jax import roofline
+from cref_jax.benchmarks import roofline
 
 X, W = jnp.ones((3, 4)), jnp.ones((4, 5))
 

@@ -23,9 +23,9 @@ from cref_jax.errors import ConfigError
 from cref_jax.evaluation import lateral_drift, protocol, scene_results
 from cref_jax.evaluation.protocol import COMMANDS, TRIAL_SECONDS
 from cref_jax.evaluation.scene_results import Condition, Outcome, Verdict
-from cref_jax.film import write_video
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
+from cref_jax.rendering.video import write_video
 from cref_jax.system import parallel
 from cref_jax.whole_body import scene_files
 from cref_jax.whole_body.disturbances import UNDISTURBED, Disturbance

@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from cref_jax import config, geoms, robot
 from cref_jax.errors import ConfigError
-from cref_jax.film import Frame
 from cref_jax.geoms import GROUND, TILE, TONES, Boxes
+from cref_jax.rendering.video import Frame
 from cref_jax.terrain import Terrain
 
 MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU

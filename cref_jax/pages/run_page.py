@@ -11,14 +11,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cref_jax import curves, evaluation_page, learning_charts, page
 from cref_jax.config import Config
-from cref_jax.curves import Log
 from cref_jax.errors import ConfigError
-from cref_jax.page import MISSING, Column, Html, Section, code, join, note, paragraph
+from cref_jax.pages import evaluation_page, learning_charts, markup, training_log
+from cref_jax.pages.markup import MISSING, Column, Html, Section, code, join, note, paragraph
+from cref_jax.pages.training_log import Log
 
 MOST_MEDIA = (
-    60 * page.MEGABYTE
+    60 * markup.MEGABYTE
 )  # bytes of all pictures and films of one page; assumed: as MOST_VIDEO
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy", "python")
 
@@ -53,7 +53,7 @@ def read(folder: Path) -> Run:
         raise ConfigError(f"{path} holds no settings")
     log, why = None, ""
     try:
-        log = curves.read(folder / "log.jsonl")
+        log = training_log.read(folder / "log.jsonl")
     except ConfigError as error:
         why = str(error)
     steps = sorted(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdecimal())
@@ -70,7 +70,7 @@ def document(run: Run) -> str:
         Section("Where it comes from", provenance(run.starts)),
         Section("Settings", settings(run.settings)),
     ]
-    return page.document(f"Run {run.folder.resolve().name}", _lead(run), sections, foot())
+    return markup.document(f"Run {run.folder.resolve().name}", _lead(run), sections, foot())
 
 
 def foot() -> str:
@@ -92,8 +92,8 @@ def settings(given: Settings) -> Html:
         paragraph("These settings differ from the defaults, which are the paper's.")
         if changed
         else paragraph("Every setting is the default, which is the paper's."),
-        page.table(columns, rows) if changed else Html(),
-        page.folded(f"All {len(ours)} settings", page.table(columns[:2], everything)),
+        markup.table(columns, rows) if changed else Html(),
+        markup.folded(f"All {len(ours)} settings", markup.table(columns[:2], everything)),
     )
 
 
@@ -120,7 +120,7 @@ def provenance(starts: tuple[Mapping[str, Any], ...]) -> Html:
         if any(name in start for start in starts)
     ]
     made_by = paragraph(f"Versions: {'; '.join(versions)}.") if versions else Html()
-    return join(page.table(columns, rows), made_by)
+    return join(markup.table(columns, rows), made_by)
 
 
 def evaluation(record: Any, source: str, iteration: int | None = None) -> Html:
@@ -128,7 +128,7 @@ def evaluation(record: Any, source: str, iteration: int | None = None) -> Html:
     try:
         if not isinstance(record, dict):
             raise ConfigError("this evaluation is no table of values")
-        shown = [evaluation_page.lead(record), page.nested(evaluation_page.sections(record))]
+        shown = [evaluation_page.lead(record), markup.nested(evaluation_page.sections(record))]
     except ConfigError as error:
         return note(code(source), f": {error}.")
     of = record.get("iteration")
@@ -167,7 +167,7 @@ def _lead(run: Run) -> Html:
         values.append((f"{log['train/samples'][-1] / 1e6:.1f} M", "samples"))
         if "samples_per_s" in log:
             values.append((_duration(float(log.minutes()[-1])), "of training"))
-    return page.tiles([*values, *learning_charts.newest(log)])
+    return markup.tiles([*values, *learning_charts.newest(log)])
 
 
 def _overview(run: Run) -> Html:
@@ -183,7 +183,7 @@ def _overview(run: Run) -> Html:
     ]
     if run.checkpoints:
         values.append(("checkpoints", ", ".join(f"{step:,}" for step in run.checkpoints)))
-    return page.pairs(values)
+    return markup.pairs(values)
 
 
 def _state(run: Run) -> str:
@@ -248,8 +248,8 @@ def _media(folder: Path) -> Html:
     left, shown = MOST_MEDIA, []
     for path in files:
         film = path.suffix.lower() == ".mp4"
-        most = min(left, page.MOST_VIDEO if film else page.MOST_PICTURE)
-        shown.append(page.media(path, most))
+        most = min(left, markup.MOST_VIDEO if film else markup.MOST_PICTURE)
+        shown.append(markup.media(path, most))
         size = path.stat().st_size
         left -= size if size <= most else 0
     if not any(path.suffix.lower() == ".mp4" for path in files):

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cref_jax import evaluation_tables, outcomes, page
 from cref_jax.errors import ConfigError
-from cref_jax.outcomes import Failures, Line, Share, called
-from cref_jax.page import MISSING, Column, Html, Section, element, join, paragraph
+from cref_jax.pages import evaluation_charts, evaluation_tables, markup
+from cref_jax.pages.evaluation_charts import Failures, Line, Share, display_name
+from cref_jax.pages.markup import MISSING, Column, Html, Section, element, join, paragraph
 from cref_jax.terrain import generators
 
 Record = Mapping[str, Any]
@@ -48,7 +48,7 @@ def write(record: Record, out: Path) -> None:
     Raises:
         ConfigError: `out` is no .html or cannot be written, or the record is of no known form.
     """
-    page.write(out, page.document(title(record), lead(record), sections(record)))
+    markup.write(out, markup.document(title(record), lead(record), sections(record)))
 
 
 def title(record: Record) -> str:
@@ -64,7 +64,7 @@ def lead(record: Record) -> Html:
     Raises:
         ConfigError: the record is of no known form.
     """
-    with_form = lambda: page.tiles(_tiles(record))
+    with_form = lambda: markup.tiles(_tiles(record))
     return _of_known_form(with_form)
 
 
@@ -153,7 +153,9 @@ def _success(record: Record, cells: Sequence[Record]) -> Html:
         for cell in cells
     ]
     failures = [_causes(_name(cell), cell) for cell in cells]
-    drawn = page.wide(outcomes.success_chart(shares), outcomes.failure_chart(failures))
+    drawn = markup.wide(
+        evaluation_charts.success_chart(shares), evaluation_charts.failure_chart(failures)
+    )
     several = any(len(share.by_policy) > 1 for share in shares)
     numbers = ("size", "successes", "success", "95 % interval", "paper")
     columns = [Column("kind"), Column("level"), *(Column(n, True) for n in numbers)]
@@ -174,7 +176,7 @@ def _success(record: Record, cells: Sequence[Record]) -> Html:
         rows.append([*row, *([_each(cell), _points(cell.get("spread"))] if several else [])])
     if several:
         columns += [Column("each policy, %", True), Column("spread, points", True)]
-    return join(_widths(cells), drawn, page.table(columns, rows))
+    return join(_widths(cells), drawn, markup.table(columns, rows))
 
 
 def _widths(cells: Sequence[Record]) -> Html:
@@ -201,15 +203,15 @@ def _failures(cells: Sequence[Record]) -> Html:
         columns = [Column("cell"), Column("up", True), Column("down", True), Column("trials", True)]
         keys = ("up_failures", "down_failures", "trials")
         rows = [[_name(c), *(_count(c.get(key)) for key in keys)] for c in ways]
-        parts.append(page.table(columns, rows, "Failures on the way up and down"))
+        parts.append(markup.table(columns, rows, "Failures on the way up and down"))
     return join(*parts)
 
 
 def _cause_table(failures: Sequence[Failures]) -> Html:
     names = list(dict.fromkeys(cause for f in failures for cause in f.by_cause))
-    columns = [Column(""), Column("trials", True), *(Column(called(n), True) for n in names)]
+    columns = [Column(""), Column("trials", True), *(Column(display_name(n), True) for n in names)]
     rows = [[f.name, str(f.trials), *(_count(f.by_cause.get(n)) for n in names)] for f in failures]
-    return page.table(columns, rows, "Failures by cause")
+    return markup.table(columns, rows, "Failures by cause")
 
 
 def _speeds(cells: Sequence[Record]) -> Html:
@@ -226,10 +228,10 @@ def _speeds(cells: Sequence[Record]) -> Html:
                 speed = f"{b['low']:.1f} to {b['high']:.1f} m/s"
                 many = (str(b["trials"]), str(b["successes"]))
                 rows.append((_name(cell), speed, *many, _percent(rate)))
-        drawn.append(outcomes.speed_chart(str(kind), lines))
+        drawn.append(evaluation_charts.speed_chart(str(kind), lines))
     numbers = [Column(title, True) for title in ("speed", "trials", "successes", "success")]
-    table = page.table([Column("cell"), *numbers], rows)
-    return join(page.charts(*drawn), page.folded("Success by speed as a table", table))
+    table = markup.table([Column("cell"), *numbers], rows)
+    return join(markup.charts(*drawn), markup.folded("Success by speed as a table", table))
 
 
 def _scenes(scenes: Sequence[Record]) -> Html:
@@ -241,8 +243,10 @@ def _scenes(scenes: Sequence[Record]) -> Html:
         (_called(s), str(s["trials"]), str(s["successes"]), _percent(s["rate"]), _interval(s))
         for s in scenes
     ]
-    drawn = page.wide(outcomes.success_chart(shares), outcomes.failure_chart(failures))
-    return join(drawn, page.table(columns, rows), _cause_table(failures))
+    drawn = markup.wide(
+        evaluation_charts.success_chart(shares), evaluation_charts.failure_chart(failures)
+    )
+    return join(drawn, markup.table(columns, rows), _cause_table(failures))
 
 
 def _conditions(conditions: Sequence[Record]) -> Html:
@@ -259,7 +263,7 @@ def _conditions(conditions: Sequence[Record]) -> Html:
         )
         for c in conditions
     ]
-    return page.table(columns, rows)
+    return markup.table(columns, rows)
 
 
 def _plain(record: Record) -> Html:
@@ -268,8 +272,8 @@ def _plain(record: Record) -> Html:
     if record.get("suite") == "cross" and "seconds" in record:
         values.append(("mean time of a success", f"{_value(record['seconds'])} s"))
     causes = record.get("by_cause") or {}
-    values += [(f"failures: {called(cause)}", str(count)) for cause, count in causes.items()]
-    return page.pairs(values) if values else Html()
+    values += [(f"failures: {display_name(cause)}", str(count)) for cause, count in causes.items()]
+    return markup.pairs(values) if values else Html()
 
 
 def _measured(record: Record) -> Html:
@@ -281,7 +285,7 @@ def _measured(record: Record) -> Html:
     versions = record.get("versions") or {}
     if versions:
         values.append(("versions", ", ".join(f"{name} {v}" for name, v in versions.items())))
-    parts.append(page.pairs(values))
+    parts.append(markup.pairs(values))
     policies = record.get("policies") or []
     if policies:
         columns = [Column("policy"), Column("from"), Column("iteration", True)]
@@ -289,14 +293,14 @@ def _measured(record: Record) -> Html:
         rows = [
             (
                 str(p.get("name", MISSING)),
-                page.code(str(p.get("source", MISSING))),
+                markup.code(str(p.get("source", MISSING))),
                 _count(p.get("iteration")),
                 _count(p.get("samples")),
-                page.code(str(p.get("digest") or MISSING)),
+                markup.code(str(p.get("digest") or MISSING)),
             )
             for p in policies
         ]
-        parts.append(page.table(columns, rows))
+        parts.append(markup.table(columns, rows))
     return join(*parts)
 
 

@@ -8,15 +8,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogFormatter
 
-from cref_jax import curves, page
-from cref_jax.curves import Log
-from cref_jax.page import Html, Section, join, paragraph
+from cref_jax.pages import markup, training_log
+from cref_jax.pages.markup import Html, Section, join, paragraph
+from cref_jax.pages.training_log import Log
 
 MOST_POINTS = 600  # of a curve: one a pixel, and more
 WINDOWS = 150  # that a log is divided into; a point is the mean over one of them
 LEAST_WINDOW = 10  # iterations
 INK, MARK = "#1d4e80", "#b5432a"
-SMALL = (page.CHART[0], 2.2)  # inches, of a reward term
+SMALL = (markup.CHART[0], 2.2)  # inches, of a reward term
 
 TITLES = {  # of the log: what it is, with its unit
     "episode/length_s": "episode length, s",
@@ -70,20 +70,20 @@ def sections(
     for start, title in GROUPS.items():
         group = tuple(name for name in names if name.startswith(start))
         drawn += [_chart(of, group, title)] if group else []
-    yield Section("Learning curves", join(_words(of, starts), page.charts(*drawn)))
+    yield Section("Learning curves", join(_words(of, starts), markup.charts(*drawn)))
     terms = [name for name in names if name.startswith("reward/")]
     used = [name for name in terms if np.nan_to_num(log[name]).any()]
     if used:
         unused = ", ".join(name.removeprefix("reward/") for name in terms if name not in used)
-        body = page.charts(*(_chart(of, (n,), n.removeprefix("reward/"), SMALL) for n in used))
+        body = markup.charts(*(_chart(of, (n,), n.removeprefix("reward/"), SMALL) for n in used))
         words = "Each term of Table I with its weight, mean over robots and steps."
         words += f" Zero throughout: {unused}." if unused else ""
         yield Section("Reward terms", join(paragraph(words), body))
     shown = {*TITLES, *terms, *(n for n in names if n.startswith(tuple(GROUPS)))}
     rest = [name for name in names if name not in shown]
     if rest:
-        body = page.charts(*(_chart(of, (name,), name, SMALL) for name in rest))
-        yield Section("Everything else in the log", page.folded(f"{len(rest)} curves", body))
+        body = markup.charts(*(_chart(of, (name,), name, SMALL) for name in rest))
+        yield Section("Everything else in the log", markup.folded(f"{len(rest)} curves", body))
 
 
 def newest(log: Log) -> Iterator[tuple[str, str]]:
@@ -91,8 +91,8 @@ def newest(log: Log) -> Iterator[tuple[str, str]]:
     of = Curves(log, (), None)
     for name, (form, title) in NEWEST.items():
         if name in log:
-            value = float(curves.smooth(log, name, of.window)[-1])
-            shown = form.format(value) if math.isfinite(value) else page.MISSING
+            value = float(training_log.smooth(log, name, of.window)[-1])
+            shown = form.format(value) if math.isfinite(value) else markup.MISSING
             yield shown, f"{title}, last {of.window} iterations"
 
 
@@ -114,7 +114,7 @@ def _words(of: Curves, starts: int) -> Html:
 
 
 def _chart(
-    of: Curves, names: Sequence[str], title: str, size: tuple[float, float] = page.CHART
+    of: Curves, names: Sequence[str], title: str, size: tuple[float, float] = markup.CHART
 ) -> Html:
     """Return curves over the samples, one a name."""
     x = of.millions
@@ -122,8 +122,8 @@ def _chart(
     def paint(axis: Axes) -> None:
         several = len(names) > 1
         for name in names:
-            mean = curves.smooth(of.log, name, of.window)
-            at = curves.thinned(len(mean), MOST_POINTS)
+            mean = training_log.smooth(of.log, name, of.window)
+            at = training_log.thinned(len(mean), MOST_POINTS)
             label = name.partition("/")[2].replace("_", " ") if several else None
             axis.plot(x[at], mean[at], lw=1.3, color=None if several else INK, label=label)
         for mark in of.marks:
@@ -136,7 +136,7 @@ def _chart(
             axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         _dress(axis, title, names, "train/samples" in of.log)
 
-    return page.chart(paint, title, size=size)
+    return markup.chart(paint, title, size=size)
 
 
 def _dress(axis: Axes, title: str, names: Sequence[str], samples: bool) -> None:

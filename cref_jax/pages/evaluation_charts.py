@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from cref_jax import page
-from cref_jax.page import Html
+from cref_jax.pages import markup
+from cref_jax.pages.markup import Html
 
 ROW = 0.27  # inches of a chart's height, for each of its rows
 FRAME = 0.8  # inches, for axis and one row of the legend
@@ -75,7 +75,7 @@ def success_chart(shares: Sequence[Share]) -> Html:
         axis.set_xlabel("trials that succeed, %")
         _legend(axis)
 
-    return page.chart(paint, "Success rates with their intervals", size=_size(len(shares)))
+    return markup.chart(paint, "Success rates with their intervals", size=_size(len(shares)))
 
 
 def failure_chart(failures: Sequence[Failures]) -> Html:
@@ -89,7 +89,9 @@ def failure_chart(failures: Sequence[Failures]) -> Html:
         for cause in causes:
             shares = 100.0 * np.array([f.by_cause.get(cause, 0) for f in failures]) / trials
             colour = _colour(cause)
-            axis.barh(np.arange(len(left)), shares, 0.7, left, color=colour, label=called(cause))
+            axis.barh(
+                np.arange(len(left)), shares, 0.7, left, color=colour, label=display_name(cause)
+            )
             left += shares
         _rows(axis, [f.name for f in failures])
         axis.set_xlim(0.0, max(1.0, 1.05 * left.max()))
@@ -97,7 +99,7 @@ def failure_chart(failures: Sequence[Failures]) -> Html:
         if causes:
             _legend(axis)
 
-    return page.chart(paint, "Failures by cause", size=_size(len(failures), len(causes)))
+    return markup.chart(paint, "Failures by cause", size=_size(len(failures), len(causes)))
 
 
 def speed_chart(title: str, lines: Sequence[Line]) -> Html:
@@ -113,10 +115,10 @@ def speed_chart(title: str, lines: Sequence[Line]) -> Html:
         axis.set_title(title)
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
-    return page.chart(paint, f"Success by speed, {title}")
+    return markup.chart(paint, f"Success by speed, {title}")
 
 
-def called(cause: str) -> str:
+def display_name(cause: str) -> str:
     """Return a cause of failure in words."""
     return CAUSES.get(cause, cause)
 
@@ -139,4 +141,4 @@ def _legend(axis: Axes) -> None:
 
 
 def _size(rows: int, entries: int = 4) -> tuple[float, float]:
-    return page.CHART[0], FRAME + ROW * rows + 0.18 * ((entries - 1) // IN_A_ROW)
+    return markup.CHART[0], FRAME + ROW * rows + 0.18 * ((entries - 1) // IN_A_ROW)

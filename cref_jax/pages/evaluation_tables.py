@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cref_jax import page
-from cref_jax.page import MISSING, Column, Html, join, paragraph
+from cref_jax.pages import markup
+from cref_jax.pages.markup import MISSING, Column, Html, join, paragraph
 
 Row = Mapping[str, Any]
 
@@ -16,7 +16,7 @@ def sideways(rows: Sequence[tuple[str, Row]]) -> Html:
     keys = ("drift_m", "largest_m", "worst_m")
     table = [(place, *(f"{100.0 * of[key]:.0f} cm" for key in keys)) for place, of in rows]
     said = "Drift is |y| at the end, y = 0 the middle of the way, to which robots are steered."
-    return join(paragraph(said), page.table(columns, table))
+    return join(paragraph(said), markup.table(columns, table))
 
 
 def parts(rates: Sequence[tuple[str, str, float]]) -> Html:
@@ -25,7 +25,7 @@ def parts(rates: Sequence[tuple[str, str, float]]) -> Html:
     places = list(dict.fromkeys(place for _, place, _ in rates))
     of = {(name, place): f"{100.0 * rate:.1f} %" for name, place, rate in rates}
     columns = [Column("randomised"), *(Column(place, True) for place in places)]
-    return page.table(columns, [(n, *(of.get((n, p), MISSING) for p in places)) for n in names])
+    return markup.table(columns, [(n, *(of.get((n, p), MISSING) for p in places)) for n in names])
 
 
 def commands(rows: Sequence[Row]) -> Html:
@@ -44,4 +44,4 @@ def commands(rows: Sequence[Row]) -> Html:
         )
         for row in rows
     ]
-    return page.table(columns, table)
+    return markup.table(columns, table)
