@@ -1,4 +1,4 @@
-"""What the commands share: errors of one line, and a polite end on Ctrl-C."""
+"""What the commands share: errors of one line, and files that can be written."""
 
 import contextlib
 import os

@@ -43,14 +43,14 @@ MARCH_TURNS = 80  # assumed: blocks that the longest ray of a frame crosses
 STAGES = (  # stage, then a file and, if it has to be, a function of the stack; the first that fits
     ("physics: MJX, line search", "mjx/_src/solver.py", "_linesearch"),
     ("physics: MJX, Newton", "mjx/_src/solver.py", ""),
-    ("physics: MJX, before the solver", "cref_jax/device_physics.py", ""),
-    ("physics: tangent planes", "cref_jax/physics.py", "planes"),
-    ("physics: rest", "cref_jax/physics.py", "step"),
-    ("update", "cref_jax/ppo.py", "update"),
-    ("policy", "cref_jax/rollout.py", "act"),
-    ("depth", "cref_jax/rollout.py", "exposed"),
-    ("environment: rest", "cref_jax/env.py", ""),
-    ("rollout: rest", "cref_jax/rollout.py", ""),
+    ("physics: MJX, before the solver", "cref_jax/physics/mjx_engine.py", ""),
+    ("physics: tangent planes", "cref_jax/physics/simulation.py", "planes"),
+    ("physics: rest", "cref_jax/physics/simulation.py", "step"),
+    ("update", "cref_jax/ppo/learner.py", "update"),
+    ("policy", "cref_jax/training/rollout.py", "policy_step"),
+    ("depth", "cref_jax/training/camera_feed.py", "render_frames"),
+    ("environment: rest", "cref_jax/env/", ""),
+    ("rollout: rest", "cref_jax/training/rollout.py", ""),
 )
 REST = "rest"
 
@@ -215,9 +215,13 @@ def estimate(program: hlo.Program, c: Config, card: Card) -> dict[str, Stage]:
             return float(
                 c.physics.iterations
             )  # the robot that takes longest takes as many as it may
-        if _is_at(stack, "cref_jax/depth.py", ""):
+        if _is_at(stack, "cref_jax/depth/raymarch.py", ""):
             return float(MARCH_TURNS)
-        return frames / c.ppo.horizon if _is_at(stack, "cref_jax/rollout.py", "_next_feed") else 1.0
+        return (
+            frames / c.ppo.horizon
+            if _is_at(stack, "cref_jax/training/camera_feed.py", "update_feed")
+            else 1.0
+        )
 
     found = collections.defaultdict(lambda: Stage(0.0, 0.0, 0.0, 0.0))
     for kernel in program.kernels(turns):
@@ -237,8 +241,7 @@ def stage_of(stack: tuple[hlo.Frame, ...]) -> str:
 
 def _is_at(stack: tuple[hlo.Frame, ...], file: str, function: str) -> bool:
     return any(
-        frame.file.endswith(file) and function in ("", *frame.function.split("."))
-        for frame in stack
+        file in frame.file and function in ("", *frame.function.split(".")) for frame in stack
     )
 
 

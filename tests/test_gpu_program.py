@@ -16,11 +16,11 @@ def frames(*places):
     return tuple(hlo.Frame(f"/there/{file}", function) for file, function in places)
 
 
-STEP = ("cref_jax/physics.py", "Physics.step.<locals>.substep")
-SUBSTEP = ("cref_jax/device_physics.py", "MjxEngine.substep")
+STEP = ("cref_jax/physics/simulation.py", "Physics.step.<locals>.substep")
+SUBSTEP = ("cref_jax/physics/mjx_engine.py", "MjxEngine.substep")
 NEWTON = ("mujoco/mjx/_src/solver.py", "solve.<locals>.body")
 SEARCH = ("mujoco/mjx/_src/solver.py", "_linesearch")
-FEED = ("cref_jax/rollout.py", "_next_feed.<locals>.<lambda>")
+FEED = ("cref_jax/training/camera_feed.py", "update_feed.<locals>.<lambda>")
 
 
 @pytest.mark.parametrize(
@@ -29,9 +29,9 @@ FEED = ("cref_jax/rollout.py", "_next_feed.<locals>.<lambda>")
         ((SEARCH, NEWTON, SUBSTEP, STEP), "physics: MJX, line search"),
         ((NEWTON, SUBSTEP, STEP), "physics: MJX, Newton"),
         ((SUBSTEP, STEP), "physics: MJX, before the solver"),
-        ((("cref_jax/physics.py", "Physics.planes"), STEP), "physics: tangent planes"),
-        ((("cref_jax/ppo.py", "update.<locals>.on_epoch"),), "update"),
-        ((("cref_jax/learn.py", "chunk"),), "rest"),
+        ((("cref_jax/physics/simulation.py", "Physics.planes"), STEP), "physics: tangent planes"),
+        ((("cref_jax/ppo/learner.py", "update.<locals>.on_epoch"),), "update"),
+        ((("cref_jax/training/iteration.py", "chunk"),), "rest"),
     ],
 )
 def test_a_kernel_belongs_to_the_stage_of_its_functions(stack, stage):
@@ -47,7 +47,9 @@ class Counted(hlo.Program):
     def kernels(self, turns):
         newton, feed = frames(NEWTON, SUBSTEP, STEP), frames(FEED)
         yield hlo.Kernel(newton, (), "fusion", 1000 * turns(newton), 8, 0)
-        yield hlo.Kernel(frames(("cref_jax/ppo.py", "update")), (), "fusion", 1, 2_680_000_000, 0)
+        yield hlo.Kernel(
+            frames(("cref_jax/ppo/learner.py", "update")), (), "fusion", 1, 2_680_000_000, 0
+        )
         yield hlo.Kernel((), newton, "copy", 24 * turns(feed), 8, 0)
 
 

@@ -9,7 +9,7 @@ TEXT = """\
 HloModule jit_chunk, is_scheduled=true
 
 FileNames
-1 "/there/cref_jax/learn.py"
+1 "/there/cref_jax/training/iteration.py"
 2 "/there/cref_jax/physics.py"
 
 FunctionNames
@@ -75,7 +75,7 @@ ENTRY %main (x: f32[100,8], y: f32[8,8], z: f32[16]) -> f32[16] {
   ROOT %choice = f32[16]{0} conditional(%p, %z, %z), true_computation=%rare, false_computation=%never
 }
 """  # noqa: E501
-LEARN = hlo.Frame("/there/cref_jax/learn.py", "chunk")
+LEARN = hlo.Frame("/there/cref_jax/training/iteration.py", "chunk")
 STEP = hlo.Frame("/there/cref_jax/physics.py", "Physics.step")
 
 

@@ -11,6 +11,33 @@ PACKAGE = Path(__file__).parents[1] / "cref_jax"
 FILES = sorted(PACKAGE.glob("**/*.py"))
 
 
+FLOORS = [
+    {"errors", "geometry", "geoms", "deploy", "system"},
+    {"config", "cli"},
+    {"robot", "terrain", "network", "ppo"},
+    {"physics", "depth", "rendering", "pages"},
+    {"env"},
+    {"training", "whole_body"},
+    {"policy", "benchmarks"},
+    {"evaluation"},
+    {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},
+]
+FLOOR = {name: number for number, floor in enumerate(FLOORS) for name in floor}
+
+WALLS = [  # a room, what it may not reach through any number of imports, and why
+    ("ppo", ("env", "robot", "physics", "terrain", "brax"), "PPO knows nothing of robots"),
+    ("network", ("env", "robot", "physics", "ppo"), "a network is a function of its inputs"),
+    ("env", ("ppo", "network", "training"), "the environment knows no learner"),
+    (
+        "whole_body",
+        ("jax", "flax", "rendering", "terrain"),
+        "it is an oracle of its own, and light",
+    ),
+    ("pages", ("env", "training", "ppo"), "a page is made of records"),
+    ("deploy", ("jax", "cref_jax", "flax", "mujoco"), "a robot has numpy alone"),
+]
+
+
 def dotted(path: Path) -> str:
     """Return the module's name within the package, such as `terrain.lanes`."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
@@ -58,9 +85,46 @@ def test_no_module_imports_itself_through_others(name):
     assert name not in reachable(name)
 
 
+def room(name: str) -> str:
+    """Return the folder of a module, or the module itself where it stands at the top."""
+    return name.partition(".")[0]
+
+
+def test_every_room_has_a_floor():
+    assert {room(name) for name in MODULES} - {""} == set(FLOOR)
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name])
+def test_a_room_imports_only_from_lower_floors(name):
+    own = room(name)
+    others = {room(other) for other in siblings(name)} - {own, ""}
+    assert {other for other in others if FLOOR[other] >= FLOOR[own]} == set()
+
+
+@pytest.mark.parametrize("room_name, forbidden, why", WALLS)
+def test_walls(room_name, forbidden, why):
+    inside = [name for name in MODULES if room(name) == room_name]
+    assert inside
+    for name in inside:
+        seen = reachable(name) | {name}
+        used = {room(other) for other in seen} & set(forbidden)
+        outside = {i.partition(".")[0] for other in seen for i in imports(tree(other))}
+        assert used | outside & set(forbidden) == set(), f"{name}: {why}"
+
+
 def test_only_one_file_touches_mjx():
     users = [name for name in MODULES if any("mjx" in i.split(".") for i in imports(tree(name)))]
     assert users == ["physics.mjx_engine"]
+
+
+def test_only_startup_changes_the_environment_when_it_is_imported():
+    changes = []
+    for name in MODULES:
+        top = [n for n in tree(name).body if not isinstance(n, (ast.FunctionDef, ast.ClassDef))]
+        text = "".join(ast.unparse(n) for n in top)
+        if "os.environ.setdefault" in text or "os.environ[" in text:
+            changes.append(name)
+    assert changes == ["deploy", "system.startup"]  # deploy stands alone on the robot
 
 
 def test_the_package_itself_is_only_a_docstring():
@@ -85,5 +149,9 @@ def test_no_function_is_longer_than_50_lines(path):
 def test_the_deployed_policy_needs_numpy_and_nothing_else():
     outside = {dotted.split(".")[0] for dotted in imports(tree("deploy"))}
     assert outside <= {"numpy", "__future__", *sys.stdlib_module_names}
-    blocked = "import sys; sys.modules['jax'] = None; import cref_jax.deploy"
+
+
+@pytest.mark.parametrize("module", ["deploy", "whole_body.trial", "whole_body.scene_files"])
+def test_what_runs_without_jax_does_not_load_it(module):
+    blocked = f"import sys; sys.modules['jax'] = None; import cref_jax.{module}"
     subprocess.run([sys.executable, "-c", blocked], check=True)

@@ -43,7 +43,7 @@ def products(program: Any, in_physics: bool = False) -> Iterator[tuple[Any, bool
     for equation in program.eqns:
         stack = equation.source_info.traceback
         files = [frame.file_name for frame in stack.frames] if stack else []
-        inside = in_physics or any(file.endswith("device_physics.py") for file in files)
+        inside = in_physics or any(file.endswith("mjx_engine.py") for file in files)
         if equation.primitive.name == "dot_general":
             yield equation.params, inside
         for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):

@@ -40,7 +40,7 @@ class Physics:
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weights w_i of Table I. A field here is a function of the same name in reward.py."""
+    """Weights w_i of Table I. A field here is a function of the same name in env/rewards.py."""
 
     linear_velocity_tracking: float = 2.5
     angular_velocity_tracking: float = 1.5

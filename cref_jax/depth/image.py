@@ -1,6 +1,6 @@
-"""The depth camera: what it sees of the ground and of the robot's own links, and when.
+"""The depth image of the ground and of the robot's own links.
 
-The image is the distance along the optical axis, as a RealSense reports it (Sec. II-D). Frames: the
+It holds distances along the optical axis, as a RealSense reports them (Sec. II-D). Frames: the
 camera's x right, y down, z forward; pixel (0, 0) is at the top left.
 """
 

@@ -5,8 +5,8 @@
     ppo.train(robots, wrap_env_fn=wrap, episode_length=robots.episode_length,
               network_factory=partial(make_ppo_networks, value_obs_key="privileged_state"), ...)
 
-`env.step` itself puts a robot whose episode is over on a lane again, with new dynamics and at the
-level that the curriculum says, and tells a failure from an episode that was cut. brax's own
+`environment.step` itself puts a robot whose episode is over on a lane again, with new dynamics and
+at the level that the curriculum says, and tells a failure from an episode that was cut. brax's own
 wrappers would put every robot back into its very first state, and take each end for a failure;
 `wrap` replaces them. Under `brax.envs.training.wrap` the environment runs all the same. A policy of
 brax's draws actions within -1 and 1, scaled to joints as `config.Robot` says.

@@ -1,4 +1,4 @@
-"""How an episode of one robot begins, what disturbs it, how it ends and what follows.
+"""How an episode begins: a settled robot on a lane, with dynamics, command and camera drawn anew.
 
 Coordinates are the lane's own: x along it from its start, y across, z = 0 at the start.
 """

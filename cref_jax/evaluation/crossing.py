@@ -1,4 +1,4 @@
-"""How well a policy walks: deterministic episodes, counted until each robot's first end."""
+"""How often a policy crosses lanes of one kind with obstacles of one size."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -27,7 +27,7 @@ class Crossing(NamedTuple):
     seconds: float  # mean time of a success
     speed: float  # m/s forward, mean over the trials
     sideways: dict[str, float] | None = (
-        None  # m, see sideways.summed; None for a robot in another simulation
+        None  # m, see lateral_drift.summarize; None for a robot in another simulation
     )
 
     def line(self) -> str:

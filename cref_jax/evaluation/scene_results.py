@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
     progress: float  # m
     speed: float  # m/s
     status: Status
-    drift: float  # m, see sideways.spans
+    drift: float  # m, see lateral_drift.spans
     aside: float  # m
 
 
@@ -56,7 +56,7 @@ class SceneResult(NamedTuple):
     wilson_high: float
     seconds: float | None  # mean time of a success
     passed: bool
-    sideways: dict[str, float]  # m, see sideways.summed
+    sideways: dict[str, float]  # m, see lateral_drift.summarize
 
 
 class ConditionResult(NamedTuple):

@@ -1,8 +1,8 @@
-"""How an exported policy does in scenes that it was not trained on, with good and bad frames.
+"""Success of an exported policy in scenes that it was not trained on, with good and bad frames.
 
-The policy is run by numpy alone on the robot's stand-in. Every trial is drawn from the seed, the
-scene's name and its own number, so that it is the same whatever else is asked for, and the same
-under every condition: what differs between two conditions is what they do.
+The policy runs by numpy alone on the whole robot. Every trial is drawn from the seed, the scene's
+name and its own number, so that it is the same whatever else is asked for, and the same under every
+condition: two conditions differ in nothing but what they do.
 """
 
 import cref_jax.system.startup  # noqa: F401

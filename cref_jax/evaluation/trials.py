@@ -103,7 +103,7 @@ def run(
     """Return what becomes of the trials.
 
     Args:
-        world: kinds in it that are not level across must be alone in it: see rollout.exposed.
+        world: a kind that is not level across must be alone in it: see camera_feed.render_frames.
         walker: what steps the robots.
         asked: the trials.
         seed: of the starts and commands.

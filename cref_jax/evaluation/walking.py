@@ -28,7 +28,7 @@ class Walk(NamedTuple):
     tracking_error: float  # m/s, of the planar velocity at each step
     airborne: tuple[float, float]  # share of time that the left and the right foot are off ground
     step_seconds: float  # mean time between two touchdowns of one foot
-    sideways: dict[str, float]  # m, see sideways.summed
+    sideways: dict[str, float]  # m, see lateral_drift.summarize
 
     def line(self) -> str:
         """Return the outcome in one line for people."""

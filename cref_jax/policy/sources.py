@@ -1,10 +1,4 @@
-"""A trained policy as a directory that needs nothing of this package, and back.
-
-manifest.json      everything but the weights, with units, frames and where it comes from
-weights.npz        float32 by flat names, stored
-testvectors.npz    what the network said in training: see vectors.py
-cref_runtime.py    deploy.py, which runs the policy with numpy alone
-"""
+"""Where a policy comes from: a run, what a run has learned, an export, or the bundled one."""
 
 import contextlib
 from pathlib import Path

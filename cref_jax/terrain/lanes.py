@@ -1,7 +1,6 @@
-"""The lanes that robots walk on: their numbers from TOML, and one grid of them all.
+"""The lanes that robots walk on, as one grid of all kinds and levels.
 
-A file in `terrains/` names kinds of lane, says how large their obstacles are at the lowest and at
-the highest level, and gives what else their shapes need. A user's own height map is a lane as well.
+Numbers come from `kind_files`, shapes from `generators`; a user's own height map is a lane as well.
 """
 
 import dataclasses

@@ -1,8 +1,9 @@
-"""The robot's stand-in: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
+"""The whole robot: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
 
-It knows nothing of the training simulation: the ground is solids and not tangent planes, depth
-comes from MuJoCo's own ray-cast, the upper body is held by its motors, and the policy is run by
-deploy.py on what a robot measures. Nothing of JAX is in its loop.
+Nothing of the training simulation is in it: the ground is solids and not tangent planes, depth
+comes from MuJoCo's own ray-cast, the upper body is held by its motors, and deploy.py runs the
+policy on what a robot measures. Its rules repeat those of training on purpose, as an independent
+oracle; tests hold each pair together.
 """
 
 import math

@@ -12,7 +12,7 @@ from cref_jax.whole_body.simulator import WholeBodySim
 
 
 class TerminationChecker:
-    """Says how a trial ends: by the rules of training (episode.ending), astray, or stalled."""
+    """Says how a trial ends: by the rules of training (env.terminations), astray, or stalled."""
 
     def __init__(self, body: WholeBodySim, state: mujoco.MjData, speed: float = 0.0) -> None:
         """Begin with the first state; `speed` is the command, m/s."""
