@@ -47,25 +47,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture
 def world():
     """Return lanes of every kind, made once."""
-    import sample
+    import small_world
 
-    return sample.world()
+    return small_world.world()
 
 
 @pytest.fixture
 def fresh_states():
     """Return 512 robots at their start."""
-    import sample
+    import small_world
 
-    return sample.fresh_states()
+    return small_world.fresh_states()
 
 
 @pytest.fixture
 def robots():
     """Return eight robots at their start."""
-    import sample
+    import small_world
 
-    return sample.robots()
+    return small_world.robots()
 
 
 @pytest.fixture(autouse=True)

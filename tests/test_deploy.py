@@ -5,7 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from random_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
+from tiny_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import config, deploy, depth
 from cref_jax.deploy import Status

@@ -5,13 +5,13 @@ import json
 import math
 import os
 
+import eval_records
 import numpy as np
 import pytest
-import records
+from html_reader import leaves, read
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from reading import leaves, read
 
 from cref_jax import config, report
 from cref_jax.config import Config
@@ -121,8 +121,11 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(run):
 
 def test_the_newest_evaluation_of_each_suite_is_shown(run):
     (run / "checkpoints" / "40").mkdir(parents=True)
-    files = {"eval_old.json": records.CROSS | {"successes": 11, "iteration": 20}}
-    files |= {"eval.json": records.CROSS | {"iteration": 30}, "eval_table.json": records.table(3)}
+    files = {"eval_old.json": eval_records.CROSS | {"successes": 11, "iteration": 20}}
+    files |= {
+        "eval.json": eval_records.CROSS | {"iteration": 30},
+        "eval_table.json": eval_records.table(3),
+    }
     for age, (name, record) in enumerate(files.items()):
         (run / name).write_text(json.dumps(record))
         os.utime(run / name, (1e9 + age, 1e9 + age))

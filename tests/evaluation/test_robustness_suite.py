@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import sample
+import small_world
 
 from cref_jax import ppo
 from cref_jax.config import Randomisation
@@ -12,7 +12,7 @@ from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS
 
 @pytest.fixture(scope="module")
 def world():
-    return robustness_suite.world(sample.C, sample.world().physics)
+    return robustness_suite.world(small_world.C, small_world.world().physics)
 
 
 def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():

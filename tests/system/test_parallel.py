@@ -14,10 +14,11 @@ from cref_jax.system import parallel
 
 SLEEPERS = """
 import functools, time
-from cref_jax import cli, processes
+from cref_jax import cli
+from cref_jax.system import parallel
 with cli.one_line_errors():
     print("begun", flush=True)
-    processes.run(functools.partial, (time.sleep,), [600.0] * 4, 2)
+    parallel.run(functools.partial, (time.sleep,), [600.0] * 4, 2)
 """
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import toy_problems
 
 from cref_jax import config
-from tests import toys
 
 pytestmark = pytest.mark.slow
 
@@ -19,32 +19,32 @@ BLIND = lambda step, cue: jnp.zeros(1)
 
 def test_a_constant_reward_is_worth_itself():
     # one step, reward 1 whatever happens: V = 1
-    toy = toys.Toy(length=1, observe=BLIND, reward=lambda step, cue, action: jnp.array(1.0))
-    outcome = toys.solve(toy, C, iterations=60)
+    toy = toy_problems.Toy(length=1, observe=BLIND, reward=lambda step, cue, action: jnp.array(1.0))
+    outcome = toy_problems.solve(toy, C, iterations=60)
     np.testing.assert_allclose(outcome.value, 1.0, atol=0.02)
 
 
 def test_a_constant_reward_is_worth_its_discounted_sum():
     # 8 steps of reward 1 at gamma .9: V_t = (1 - .9^(8 - t)) / .1, from 5.695 down to 1
-    toy = toys.Toy(length=8, observe=BLIND, reward=lambda step, cue, action: jnp.array(1.0))
-    outcome = toys.solve(toy, replace(C, gamma=0.9), iterations=150)
+    toy = toy_problems.Toy(length=8, observe=BLIND, reward=lambda step, cue, action: jnp.array(1.0))
+    outcome = toy_problems.solve(toy, replace(C, gamma=0.9), iterations=150)
     expected = (1.0 - 0.9 ** (8 - np.arange(8))) / 0.1
     np.testing.assert_allclose(outcome.value[:, 0], expected, atol=0.15)
 
 
 def test_the_action_that_pays_best_is_found():
     # reward 1 - (a - .7)^2: the best action is .7
-    toy = toys.Toy(1, BLIND, lambda step, cue, action: 1.0 - (action - 0.7) ** 2)
-    outcome = toys.solve(toy, C, iterations=100)
+    toy = toy_problems.Toy(1, BLIND, lambda step, cue, action: 1.0 - (action - 0.7) ** 2)
+    outcome = toy_problems.solve(toy, C, iterations=100)
     np.testing.assert_allclose(outcome.mean_action, 0.7, atol=0.05)
 
 
 def test_the_action_follows_the_observation():
     # reward 1 - (a - cue)^2 with the cue in sight: the best action is the cue
-    toy = toys.Toy(
+    toy = toy_problems.Toy(
         1, lambda step, cue: cue[None], lambda step, cue, action: 1.0 - (action - cue) ** 2
     )
-    outcome = toys.solve(toy, C, iterations=150)
+    outcome = toy_problems.solve(toy, C, iterations=150)
     np.testing.assert_allclose(outcome.mean_action, [[-1.0, 1.0]], atol=0.08)
 
 
@@ -53,19 +53,19 @@ def test_credit_reaches_the_step_that_earned_it(gamma, best):
     # Step 0 pays a at once and costs (a + .5)^2 one step later:
     # Q(a) = a - gamma (a + .5)^2, dQ/da = 1 - 2 gamma (a + .5) = 0 at a = 1/(2 gamma) - .5.
     # gamma .5: a = .5, V_0 = .5 - .5 * 1 = 0 ; gamma .25: a = 1.5, V_0 = 1.5 - .25 * 4 = .5
-    toy = toys.Toy(
+    toy = toy_problems.Toy(
         length=2,
         observe=BLIND,
         reward=lambda step, cue, action: jnp.where(step == 0, action, -((cue + 0.5) ** 2)),
         advance=lambda step, cue, action: action,
     )
-    outcome = toys.solve(toy, replace(C, gamma=gamma), iterations=250)
+    outcome = toy_problems.solve(toy, replace(C, gamma=gamma), iterations=250)
     np.testing.assert_allclose(outcome.mean_action[0], best, atol=0.15)
     np.testing.assert_allclose(outcome.value[0], best - gamma * (best + 0.5) ** 2, atol=0.1)
 
 
 # The cue is in sight in step 0 alone; only the last step is paid: 1 - (a - cue)^2.
-RECALL = toys.Toy(
+RECALL = toy_problems.Toy(
     length=6,
     observe=lambda step, cue: jnp.stack([jnp.where(step == 0, cue, 0.0), (step == 5) * 1.0]),
     reward=lambda step, cue, action: jnp.where(step == 5, 1.0 - (action - cue) ** 2, 0.0),
@@ -73,11 +73,11 @@ RECALL = toys.Toy(
 
 
 def test_a_cue_is_remembered():
-    outcome = toys.solve(RECALL, C, iterations=250)
+    outcome = toy_problems.solve(RECALL, C, iterations=250)
     np.testing.assert_allclose(outcome.mean_action[5], [-1.0, 1.0], atol=0.15)
 
 
 def test_without_memory_a_cue_is_not_remembered():
     # the control of the test above: the best that is left is 0
-    outcome = toys.solve(RECALL, C, iterations=250, memory=False)
+    outcome = toy_problems.solve(RECALL, C, iterations=250, memory=False)
     np.testing.assert_allclose(outcome.mean_action[5], 0.0, atol=0.15)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Bool, Int
 from PIL import Image
-from random_policy import ROBOT, SMALL, policy
+from tiny_policy import ROBOT, SMALL, policy
 
 from cref_jax import cli, config
 from cref_jax.config import Config
@@ -30,7 +30,7 @@ CELL = 0.1  # m
 
 def lab(name: str) -> ModuleType:
     """Return a script of experiments/ as a module."""
-    path = Path(__file__).parents[1] / "experiments" / f"{name}.py"
+    path = Path(__file__).parents[2] / "experiments" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module

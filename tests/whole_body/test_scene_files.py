@@ -1,10 +1,10 @@
 import dataclasses
 
+import foot_planner
 import mujoco
 import numpy as np
 import pytest
-import stepper
-from random_policy import ROBOT
+from tiny_policy import ROBOT
 
 from cref_jax import config, deploy, robot
 from cref_jax.config import Config
@@ -109,31 +109,31 @@ def test_the_start_is_level_and_free(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_scene_can_be_passed_on_foot(name):
-    assert stepper.walk(SCENES[name])[-1].x > SCENES[name].end - 0.45
+    assert foot_planner.walk(SCENES[name])[-1].x > SCENES[name].end - 0.45
 
 
 def test_a_ditch_that_is_too_wide_cannot_be_passed_on_foot(scene):
-    with pytest.raises(stepper.Impassable, match="no foothold"):
-        stepper.walk(scene("ditches = [[2.5, 3.5]]\n"))
+    with pytest.raises(foot_planner.Impassable, match="no foothold"):
+        foot_planner.walk(scene("ditches = [[2.5, 3.5]]\n"))
 
 
 def test_a_rail_across_the_path_cannot_be_passed_on_foot(scene):
     rail = "[[cylinder]]\nends = [[3.0, -1.0, 0.9], [3.0, 1.0, 0.9]]\nradius = 0.02\n"
-    with pytest.raises(stepper.Impassable, match="meets something"):
-        stepper.walk(scene(rail))
+    with pytest.raises(foot_planner.Impassable, match="meets something"):
+        foot_planner.walk(scene(rail))
 
 
 def test_posts_too_near_to_each_other_cannot_be_passed_on_foot(scene):
     posts = "[[cylinder]]\nends = [[3.0, 0.4, 0.0], [3.0, 0.4, 1.0]]\nradius = 0.03\n"
-    with pytest.raises(stepper.Impassable, match="meets something"):
-        stepper.walk(scene(posts))
+    with pytest.raises(foot_planner.Impassable, match="meets something"):
+        foot_planner.walk(scene(posts))
 
 
 def test_a_balancing_ledge_bears_no_foot(scene):
     ledge = "ditches = [[2.5, 3.5]]\n[[box]]\nx = [2.4, 3.6]\ny = [{}, {}]\nz = [-0.1, 0.0]\n"
-    with pytest.raises(stepper.Impassable):
-        stepper.walk(scene(ledge.format(-0.03, 0.03)))
-    stepper.walk(scene(ledge.format(-0.3, 0.3)))
+    with pytest.raises(foot_planner.Impassable):
+        foot_planner.walk(scene(ledge.format(-0.03, 0.03)))
+    foot_planner.walk(scene(ledge.format(-0.3, 0.3)))
 
 
 def test_rays_go_through_holes_and_stop_at_what_is_between():
@@ -275,7 +275,7 @@ def test_a_foot_stands_across_slots_that_its_spheres_would_sink_into(scene):
         state = placed(body, x=0.755, z=ROBOT.standing_height + 0.152)
         for _ in range(30):  # 0.15 s
             mujoco.mj_step(body.model, state)
-        sunk[stops] = 0.15 - (state.xpos[body.feet, 2].mean() - stepper.ANKLE)
+        sunk[stops] = 0.15 - (state.xpos[body.feet, 2].mean() - foot_planner.ANKLE)
     assert sunk[True] < 0.01 < 0.03 < sunk[False]
 
 

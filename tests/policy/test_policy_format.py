@@ -9,7 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from random_policy import ROBOT, J, contents, policy
+from tiny_policy import ROBOT, J, contents, policy
 
 from cref_jax import deploy
 from cref_jax.deploy import PolicyFormatError

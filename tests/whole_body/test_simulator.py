@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from random_policy import ROBOT, contents, policy
-from sample import put
+from small_world import put
+from tiny_policy import ROBOT, contents, policy
 
 from cref_jax import deploy, depth, sim2sim, terrain
 from cref_jax.config import Config

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from sample import ROBOTS, C, assert_equal, one, put
+from small_world import ROBOTS, C, assert_equal, one, put
 
 from cref_jax import config
 from cref_jax.env import environment, footholds, gait, observations, rewards

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sample
-from sample import ROBOTS, C, assert_equal, on, one, put
+import small_world
+from small_world import ROBOTS, C, assert_equal, on, one, put
 
 from cref_jax import config, geometry, terrain
 from cref_jax.env import commands, curriculum, events, resets, terminations
@@ -302,7 +302,7 @@ def test_nobody_is_pushed_without_randomisation(world, robots):
 
 @pytest.fixture(scope="module")
 def causes():
-    world = sample.world()
+    world = small_world.world()
     judge = jax.jit(
         lambda state: terminations.check_termination(
             world, state, world.physics.links(state.body), jnp.zeros((), bool)

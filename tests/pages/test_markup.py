@@ -5,8 +5,8 @@ import os
 import re
 
 import pytest
+from html_reader import Page, leaves, read
 from PIL import Image
-from reading import Page, leaves, read
 
 from cref_jax.errors import ConfigError
 from cref_jax.pages import markup

@@ -27,6 +27,7 @@ from cref_jax.training.checkpoint import Checkpoints
 # A read that fails leaves threads of orbax behind that complain of a closed loop.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
+HERE = Path(__file__).parent  # where another process finds this file
 META = {"config": {"ppo": {"clip": 0.2}, "scan": {"x": [0.0, 1.0, 2]}}, "num_envs": 6}
 
 
@@ -341,13 +342,14 @@ def test_a_disk_that_refuses_leaves_the_last_step_good(run):
     """A limit on the size of files stands in for a full disk."""
     code = """
 import resource, sys
-from tests.test_checkpoint import META, Checkpoints, state
+from test_checkpoint import META, Checkpoints, state
 with Checkpoints(sys.argv[1]) as checkpoints:
     carry, _ = checkpoints.restore(state(99))
     resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))
     checkpoints.save(4, state(4), META)
 """
-    done = subprocess.run([sys.executable, "-c", code, str(run)], capture_output=True, text=True)
+    command = [sys.executable, "-c", code, str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=HERE)
     assert done.returncode == 1
     assert "CheckpointError: " + str(run / "4") + ": could not be written: " in done.stderr
     with Checkpoints(run) as checkpoints:
@@ -370,7 +372,7 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path):
 def test_a_kill_at_any_time_leaves_the_last_step_complete(tmp_path):
     code = """
 import sys
-from tests.test_checkpoint import META, Checkpoints, state
+from test_checkpoint import META, Checkpoints, state
 with Checkpoints(sys.argv[1]) as checkpoints:
     newest = checkpoints.latest()
     if newest is not None:
@@ -382,7 +384,7 @@ with Checkpoints(sys.argv[1]) as checkpoints:
     draw = random.Random(1)
     for _ in range(5):
         command = [sys.executable, "-c", code, str(tmp_path)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE)
         assert process.stdout is not None
         said = [process.stdout.readline()]
         time.sleep(draw.uniform(0.0, 0.4))
@@ -407,13 +409,13 @@ def test_two_runs_do_not_share_a_directory(tmp_path):
 def test_the_lock_of_a_killed_run_is_taken_over(tmp_path, caplog):
     code = """
 import sys, time
-from cref_jax import checkpoint
+from cref_jax.training import checkpoint
 with checkpoint.lock(sys.argv[1]):
     print("locked", flush=True)
     time.sleep(60)
 """
     command = [sys.executable, "-c", code, str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE)
     assert process.stdout is not None and process.stdout.readline() == "locked\n"
     with pytest.raises(CheckpointError, match=f"process {process.pid} "):
         checkpoint.lock(tmp_path).__enter__()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).parents[1] / "experiments" / "gpu_run.sh"
+SCRIPT = Path(__file__).parents[2] / "experiments" / "gpu_run.sh"
 
 
 @pytest.mark.parametrize(

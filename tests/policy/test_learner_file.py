@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from random_policy import SMALL
+from tiny_policy import SMALL
 
 from cref_jax import config
 from cref_jax.errors import ConfigError

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sample
+import small_world
 
 from cref_jax import config, depth, ppo
 from cref_jax.config import Config
@@ -20,7 +20,7 @@ E, T = 4, 12
 def small(variant: str) -> Config:
     """Return a small network on short episodes, so that some end within a horizon."""
     return config.override(
-        sample.C,
+        small_world.C,
         {
             "run": {"num_envs": E},
             "ppo": {"horizon": T, "minibatches": 2},
@@ -40,7 +40,7 @@ def small(variant: str) -> Config:
 
 def two_horizons(variant: str):
     """Return the world, the learner, and two successive horizons with the robots before each."""
-    world = sample.world().replace(config=small(variant))
+    world = small_world.world().replace(config=small(variant))
     c = world.config
     state = jax.jit(iteration.initial_state)(world)
     nets = rollout.networks(c.network, len(world.physics.robot.joint_names))

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from random_policy import SMALL
-from sample import assert_equal, one
+from small_world import assert_equal, one
+from tiny_policy import SMALL
 
 from cref_jax import config
 from cref_jax.config import Config

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_policy import ROBOT, SMALL, J, policy, recorded
+from tiny_policy import ROBOT, SMALL, J, policy, recorded
 
 from cref_jax import config, deploy, robot
 from cref_jax.errors import ConfigError

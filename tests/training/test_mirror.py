@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import sample
-from sample import ROBOTS, C, on, one
+import small_world
+from small_world import ROBOTS, C, on, one
 
 from cref_jax import config, network
 from cref_jax.env import environment
@@ -108,7 +108,7 @@ def taught():
             "network": {"token": 8, "lstm": 8, "gru": 8, "actor": [8], "critic": [8]},
         },
     )
-    world = sample.world().replace(config=c)
+    world = small_world.world().replace(config=c)
     return world, jax.jit(iteration.initial_state)(world)
 
 

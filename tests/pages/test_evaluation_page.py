@@ -4,9 +4,9 @@ import os
 import shutil
 import subprocess
 
+import eval_records
 import pytest
-import records
-from reading import leaves, read
+from html_reader import leaves, read
 
 from cref_jax.errors import ConfigError
 from cref_jax.pages import evaluation_charts, evaluation_page
@@ -26,7 +26,7 @@ def row(seen, *cells):
 
 @pytest.mark.parametrize("policies", [1, 3])
 def test_every_cell_and_number_of_a_table_is_shown(tmp_path, policies):
-    record = records.table(policies)
+    record = eval_records.table(policies)
     seen = written(record, tmp_path)
     assert leaves(seen) == []
     for cell in record["cells"]:
@@ -59,7 +59,7 @@ def test_every_cell_and_number_of_a_table_is_shown(tmp_path, policies):
 
 def test_the_head_says_the_overall_rate_its_interval_and_how_far_the_paper_is(tmp_path):
     # 0.613 against 0.9046: 29.16 points; 0.704 against 0.9811: 27.71; 0.305 against 0.675: 37.0
-    text = written(records.table(), tmp_path).text
+    text = written(eval_records.table(), tmp_path).text
     assert "61.3 %of the trials succeed, over all cells (95 % interval 59.2 to 63.4 %)" in text
     assert "29.2 points lower than the paper's 90.46 %" in text
     assert "27.7 points lower than the paper's 98.11 %" in text
@@ -68,7 +68,7 @@ def test_the_head_says_the_overall_rate_its_interval_and_how_far_the_paper_is(tm
 
 def test_a_difference_is_said_in_words(tmp_path):
     # gap easy: 0.96 - 0.993 = -3.3 points; gap ood: 0.195 - 0.447 = -25.2 points
-    record = records.table()
+    record = eval_records.table()
     record["cells"][0]["paper"] |= {"difference": 0.021, "significant": True}
     seen = written(record, tmp_path)
     assert row(seen, "gap", "easy")[7] == "3.3 points lower, within chance"
@@ -78,7 +78,7 @@ def test_a_difference_is_said_in_words(tmp_path):
 
 def test_how_much_the_intervals_leave_open_is_said(tmp_path):
     # narrowest: stairs easy, 0.954 to 1.0, half of it 2.3; widest: platform, (0.033 + 0.027) / 2
-    text = written(records.table(), tmp_path).text
+    text = written(eval_records.table(), tmp_path).text
     assert "With 200 trials a cell, the 95 % intervals (Wilson) reach 2.3 to 3.0 points" in text
     assert "The paper counts 2000 trials a cell." in text
 
@@ -94,7 +94,7 @@ def test_how_much_the_intervals_leave_open_is_said(tmp_path):
     ],
 )
 def test_what_a_cell_lacks_is_left_out_and_the_rest_is_shown(tmp_path, key, gone):
-    record = records.table(3)
+    record = eval_records.table(3)
     assert gone in written(record, tmp_path).text
     for cell in record["cells"]:
         del cell[key]
@@ -105,13 +105,13 @@ def test_what_a_cell_lacks_is_left_out_and_the_rest_is_shown(tmp_path, key, gone
 
 @pytest.mark.parametrize("key", ["overall", "policies", "versions", "rule", "seconds", "device"])
 def test_what_a_record_lacks_is_left_out(tmp_path, key):
-    record = records.table()
+    record = eval_records.table()
     del record[key]
     assert row(written(record, tmp_path), "gap", "hard")[3] == "124 of 200"
 
 
 def test_every_scene_and_condition_is_shown(tmp_path):
-    record = records.ood()
+    record = eval_records.ood()
     seen = written(record, tmp_path)
     assert "4 of 6scenes passed" in seen.text
     for scene in record["scenes"]:
@@ -124,24 +124,28 @@ def test_every_scene_and_condition_is_shown(tmp_path):
 
 
 def test_how_far_robots_come_off_their_way_is_shown(tmp_path):
-    seen = written(records.table(), tmp_path)
+    seen = written(eval_records.table(), tmp_path)
     assert row(seen, "gap hard, 75 cm", "11 cm")[1:] == ["11 cm", "24 cm", "57 cm"]
-    seen = written(records.ood(), tmp_path)
+    seen = written(eval_records.ood(), tmp_path)
     assert row(seen, "Pallets with slots of 3 cm", "13 cm")[1:] == ["13 cm", "32 cm", "68 cm"]
-    assert row(written(records.WALK, tmp_path), "flat ground")[1:] == ["14 cm", "26 cm", "38 cm"]
+    assert row(written(eval_records.WALK, tmp_path), "flat ground")[1:] == [
+        "14 cm",
+        "26 cm",
+        "38 cm",
+    ]
 
 
 def test_success_with_each_part_alone_is_shown(tmp_path):
     part = {"kind": "gap", "level": "medium", "size_m": 0.5, "trials": 50, "successes": 41}
     rows = [part | {"part": "pushes", "rate": 0.82}, part | {"part": "noise", "rate": 0.96}]
-    seen = written(records.table() | {"suite": "robust", "parts": rows}, tmp_path)
+    seen = written(eval_records.table() | {"suite": "robust", "parts": rows}, tmp_path)
     assert "Success with everything randomised" in seen.text
     assert row(seen, "pushes") == ["pushes", "82.0 %"]
     assert row(seen, "noise") == ["noise", "96.0 %"]
 
 
 def test_how_commands_are_obeyed_is_shown(tmp_path):
-    seen = written(records.COMMANDS, tmp_path)
+    seen = written(eval_records.COMMANDS, tmp_path)
     assert "33 of 40told to stand, move less than 5 cm" in seen.text
     assert "29 of 40told to stand, take no step" in seen.text and "42 cmfurther" in seen.text
     stand = row(seen, "0.00, 0.00, 0.00")
@@ -150,10 +154,10 @@ def test_how_commands_are_obeyed_is_shown(tmp_path):
 
 
 def test_the_records_of_one_kind_are_shown(tmp_path):
-    walk = written(records.WALK, tmp_path).text
+    walk = written(eval_records.WALK, tmp_path).text
     assert "197 of 200episodes without a fall" in walk and "0.0936 m/s" in walk
     assert "0.343, 0.312" in walk and "pelvis too low1" in walk
-    cross = written(records.CROSS | {"seconds": float("nan")}, tmp_path).text
+    cross = written(eval_records.CROSS | {"seconds": float("nan")}, tmp_path).text
     assert "Crossing obstacles: gap, 30 cm" in cross and "95.5 %of 200 trials" in cross
 
 
@@ -174,7 +178,7 @@ def test_a_record_of_another_form_is_one_line(tmp_path, record):
 
 
 def test_names_with_markup_or_formulas_are_shown_as_they_are(tmp_path):
-    record = records.table()
+    record = eval_records.table()
     record["cells"][3] |= {"kind": "<u>$x^$", "level": "$\\frac$"}
     record["policies"][0]["name"] = "<script>"
     seen = written(record, tmp_path)
@@ -204,7 +208,7 @@ def test_a_browser_shows_the_cells_and_has_nothing_to_complain_about(tmp_path):
         return out.stdout, [line for line in out.stderr.splitlines() if "CONSOLE" in line]
 
     path = tmp_path / "evaluation.html"
-    record = records.table(3)
+    record = eval_records.table(3)
     evaluation_page.write(record, path)
     dom, complaints = shown(path)
     assert complaints == []

@@ -8,7 +8,7 @@ import pytest
 from cref_jax import config, robot
 from cref_jax.robot import x2_ultra
 
-FACTS = json.loads((Path(__file__).parent / "x2_facts.json").read_text())
+FACTS = json.loads((Path(__file__).parents[1] / "data" / "x2_facts.json").read_text())
 ACTUATED = ["legs", "legs+waist", "all"]
 
 
