@@ -20,7 +20,7 @@ class Options:
 
     measured: Path = HERE / "bench.json"
     """what the benchmark wrote"""
-    out: Path = HERE / "bench.png"
+    out: Path = HERE / "figures" / "bench.png"
     """the picture to write"""
 
 

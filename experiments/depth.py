@@ -1,4 +1,4 @@
-"""Draw what the robot sees: `python experiments/depth.py --out experiments/depth.png`.
+"""Draw what the robot sees: `python experiments/depth.py`.
 
 It stands at the nominal pose, 0.6 m before the first obstacle of each kind of lane, with one of
 the middle sizes; at last it lifts a knee into the view. Takes seconds.
@@ -27,7 +27,7 @@ LEVEL = 5  # of 0 to 9
 class Options:
     """Draw the depth image of each kind of terrain."""
 
-    out: Path = Path("depth.png")
+    out: Path = Path(__file__).parent / "figures" / "depth.png"
     """the picture to write"""
 
 

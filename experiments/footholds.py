@@ -1,4 +1,4 @@
-"""Draw what a foot may step on: `python experiments/footholds.py --out footholds.png`."""
+"""Draw what a foot may step on: `python experiments/footholds.py`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ class Options:
 
     command: float = 0.6
     """forward command, m/s"""
-    out: Path = Path("footholds.png")
+    out: Path = Path(__file__).parent / "figures" / "footholds.png"
     """the picture to write"""
 
 

@@ -1,4 +1,4 @@
-"""Draw the twenty scenes: `python experiments/ood_scenes.py --out experiments/ood_scenes.png`.
+"""Draw the twenty scenes: `python experiments/ood_scenes.py`.
 
 Each is shown with the robot standing in it at the nominal pose, and beside it what the robot's
 depth camera sees there, whatever reads nothing at the far plane. Takes seconds.
@@ -53,7 +53,7 @@ PLACES = {  # m along x where the robot stands; elsewhere 1.3 m, before the firs
 class Options:
     """Draw every scene and what is seen there."""
 
-    out: Path = Path("ood_scenes.png")
+    out: Path = Path(__file__).parent / "figures" / "ood_scenes.png"
     """the picture to write"""
 
 

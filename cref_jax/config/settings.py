@@ -17,7 +17,7 @@ class Robot:
 
     actuated: Literal["legs", "legs+waist", "all"] = "legs"  # assumed: Table I regularises these
     held: Literal["none", "waist", "all"] = "all"  # moves, too, held by its motors; the rest is
-    # welded. assumed: welded, transfer to the whole robot suffers, see experiments/README.md
+    # welded. assumed: welded, transfer to the whole robot suffers, see experiments/RESULTS.md
     action_scale: float = 0.25  # of effort / kp, rad; assumed: the usual scale for these gains
     action_clip: float = 10.0  # actions; assumed: far outside what is ever useful
 
