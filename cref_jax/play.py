@@ -138,7 +138,9 @@ def play(options: Options) -> None:
     world = _world(options, c)
     train = sources.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
-    model = robot_scene.build(robot.moving(c.robot), c.physics, world.lanes.tile(0, 0))
+    model = robot_scene.build(
+        robot.moving(c.robot), c.physics, world.lanes.tile(0, 0), c.robot.name
+    )
     with robot_scene.Canvas(model, STILL_WIDTH if options.stills else WIDTH, HEIGHT) as canvas:
         recording = record(world, train, options)
         if options.stills:

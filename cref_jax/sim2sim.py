@@ -191,7 +191,7 @@ def _film(out: Path, world: World, trial: Trial) -> None:
     points = robot_scene.camera_path(trial.qpos, period)
     moments = range(0, len(trial.qpos), stride)
     with robot_scene.Canvas(
-        robot_scene.build("all", c.physics, world.lanes.tile(0, 0)), *SIZE
+        robot_scene.build("all", c.physics, world.lanes.tile(0, 0), c.robot.name), *SIZE
     ) as canvas:
         frames = (canvas.draw(trial.qpos[t], points[t]) for t in track(moments, "drawing"))
         video.write_video(out, frames, 1.0 / (stride * period))

@@ -63,7 +63,8 @@ def view(c: config.Config, ground: terrain.Terrain, lift: float) -> np.ndarray:
     joints = x2.rest_pose.copy()
     joints[x2.joint_names.index("left_hip_pitch_joint")] -= lift
     qpos = jnp.concatenate([jnp.array(base), joints])
-    tree = kinematics.tree(robot.spec(robot.moving(c.robot), c.physics).compile())
+    spec = robot.spec(robot.moving(c.robot), c.physics, name=c.robot.name)
+    tree = kinematics.tree(spec.compile())
     links = kinematics.links(tree, qpos, jnp.zeros(qpos.size - 1))
     position, rotation = depth.pose(links, x2.camera, c.camera, 0.0, jnp.zeros(3))
     capsules = depth.capsules_in_view(links, x2.capsules)

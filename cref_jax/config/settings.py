@@ -13,8 +13,9 @@ Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind"]
 
 @dataclass(frozen=True)
 class Robot:
-    """The AGIBOT X2 Ultra as the policy drives it (Sec. III-A)."""
+    """The robot, and how the policy drives it (Sec. III-A)."""
 
+    name: str = "x2_ultra"  # an entry of robot/registry.py
     actuated: Literal["legs", "legs+waist", "all"] = "legs"  # assumed: Table I regularises these
     held: Literal["none", "waist", "all"] = "all"  # moves, too, held by its motors; the rest is
     # welded. assumed: welded, transfer to the whole robot suffers, see experiments/RESULTS.md

@@ -127,8 +127,8 @@ def film(
     ground = scene_files.named(name)
     runner = _Runner(policy or sources.bundled_policy(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
-    physics = runner.config.physics
-    spec = robot_scene.stage("all", physics, -scene_files.DITCH - robot_scene.BASE)
+    physics, name = runner.config.physics, runner.config.robot.name
+    spec = robot_scene.stage("all", physics, -scene_files.DITCH - robot_scene.BASE, name)
     ground.add_to(spec, friction)
     stride = max(1, round(1.0 / (FRAME_RATE * physics.control_period)))
     points = robot_scene.camera_path(trial.qpos, physics.control_period)

@@ -40,9 +40,10 @@ class Physics:
         self.config = physics_config
         self.robot = robot.load(robot_config)
         self.feet = np.array(self.robot.ankles)  # body ids
-        spec = robot.spec(robot.moving(robot_config), physics_config)
+        name = robot_config.name
+        spec = robot.spec(robot.moving(robot_config), physics_config, name=name)
         if engine != "mjx":
-            robot.add_force_sensors(spec)
+            robot.add_force_sensors(spec, name)
         if engine == "mujoco":
             robot.solve_sparsely(spec)
         if engine == "warp":  # it never resets a state by itself, and takes no flag against it

@@ -112,7 +112,7 @@ def _command(c: Config) -> dict[str, Any]:
 def _depth(c: Config) -> dict[str, Any]:
     whole = dataclasses.replace(c.robot, actuated="all")
     mount = robot.load(whole).camera
-    model = robot.spec("all", c.physics, contact_planes=0).compile()
+    model = robot.spec("all", c.physics, contact_planes=0, name=c.robot.name).compile()
     rows, columns = c.camera.shape
     return {
         "rows": rows,

@@ -44,6 +44,7 @@ def digest(policy: TrainedPolicy) -> str:
     """Return the SHA-256 of all that decides what a policy does, the same for run and export."""
     c = policy.config
     settings = [dataclasses.asdict(part) for part in (c.network, c.robot, c.camera)]
+    del settings[1]["name"]  # its joints decide, and digests from before robots had names hold
     found = hashlib.sha256(json.dumps(settings).encode())
     arrays = pytree_digest.on_host(policy.train.params.actor["params"])
     seen = policy.train.statistics.obs

@@ -13,6 +13,7 @@ from cref_jax import config, geoms, robot
 from cref_jax.errors import ConfigError
 from cref_jax.geoms import GROUND, TILE, TONES, Boxes
 from cref_jax.rendering.video import Frame
+from cref_jax.robot.registry import describe
 from cref_jax.terrain import Terrain
 
 MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU
@@ -31,10 +32,15 @@ VIEW = 32.0  # deg, vertical
 CALM = 1.0  # s of the pelvis's way that the camera averages over
 
 
-def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) -> mujoco.MjModel:
+def build(
+    moves: robot.Actuated,
+    physics: config.Physics,
+    ground: Terrain,
+    name: str = config.Robot.name,
+) -> mujoco.MjModel:
     """Return the model to draw; its qpos is that of the physics, its x and y those of `ground`."""
     heights, origin = window(ground)
-    spec = stage(actuated, physics, float(heights.min()) - BASE)
+    spec = stage(moves, physics, float(heights.min()) - BASE, name)
     found = geoms.boxes(heights, max(1, round(TILE / ground.cell)))
     if found is None:
         _add_field(spec, heights, origin, ground.cell)
@@ -43,10 +49,12 @@ def build(actuated: robot.Actuated, physics: config.Physics, ground: Terrain) ->
     return spec.compile()
 
 
-def stage(actuated: robot.Actuated, physics: config.Physics, z: float) -> mujoco.MjSpec:
+def stage(
+    moves: robot.Actuated, physics: config.Physics, z: float, name: str = config.Robot.name
+) -> mujoco.MjSpec:
     """Return the robot in its light, over an endless plain at height z, m."""
-    spec = robot.spec(actuated, physics, contact_planes=0, visual=True)
-    _add_light(spec)
+    spec = robot.spec(moves, physics, contact_planes=0, visual=True, name=name)
+    _add_light(spec, describe(name).base)
     _add_plain(spec, z)
     return spec
 
@@ -199,7 +207,7 @@ def _add_plain(spec: mujoco.MjSpec, z: float) -> None:
     )
 
 
-def _add_light(spec: mujoco.MjSpec) -> None:
+def _add_light(spec: mujoco.MjSpec, base: str) -> None:
     """Add the sky, soft light from everywhere, and a sun above the robot that casts shadows."""
     spec.add_texture(
         name="sky",
@@ -210,7 +218,7 @@ def _add_light(spec: mujoco.MjSpec) -> None:
         width=256,
         height=1536,
     )
-    spec.body("pelvis").add_light(
+    spec.body(base).add_light(
         pos=[-1.5, -2.5, 5.0],
         dir=[0.3, 0.5, -1.0],
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK,

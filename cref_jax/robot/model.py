@@ -1,7 +1,7 @@
-"""The AGIBOT X2 Ultra as data, and the model to train on, derived from its MJCF.
+"""The model to train on, derived from a robot's MJCF, and the numbers read off it.
 
-Masses, limits and gains stand in `x2_ultra.xml` and are read off the compiled model; the
-nominal pose and the roles of joints and links stand in `x2_ultra.py`.
+Masses, limits and gains stand in the MJCF; the nominal pose and the roles of joints and links in
+the robot's `Description`.
 """
 
 from dataclasses import dataclass
@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cref_jax import config
-from cref_jax.robot import x2_ultra
-from cref_jax.robot.x2_ultra import IN_VIEW, KEPT_CLEAR, LEG_JOINTS, XML
+from cref_jax.robot.conventions import check_conventions
+from cref_jax.robot.description import Description
+from cref_jax.robot.registry import describe
 
 Actuated = Literal["legs", "legs+waist", "all"]
 MOVING: dict[str, Actuated] = {"none": "legs", "waist": "legs+waist", "all": "all"}  # at least
@@ -21,7 +22,7 @@ FRICTION = 0.9  # of a contact sphere on the ground; assumed: rubber on a dry fl
 
 
 class Spheres(NamedTuple):
-    """Where the robot touches the world: S = 16 spheres, six under each foot, two on each shank."""
+    """Where the robot touches the world: S spheres under feet and on shanks."""
 
     names: tuple[str, ...]
     body: Int[np.ndarray, " S"]  # body id in the model of `spec`
@@ -82,14 +83,15 @@ class Robot:
 
 def load(c: config.Robot) -> Robot:
     """Return the robot with the joints of `c.actuated`, read off the model that moves."""
-    model = spec(moving(c), config.Physics(), contact_planes=0, visual=True).compile()
-    joints = range(1, model.njnt)  # joint 0 is the pelvis's freejoint
-    rest = np.array([x2_ultra.nominal_angle(model.joint(j).name) for j in joints])
-    names = tuple(n for j in joints if _moves(n := model.joint(j).name, c.actuated))
+    data = describe(c.name)
+    model = spec(moving(c), config.Physics(), 0, visual=True, name=c.name).compile()
+    joints = [model.joint(j).name for j in range(1, model.njnt)]  # joint 0 is the base's
+    rest = np.array([data.nominal_angle(joint) for joint in joints])
+    names = tuple(joint for joint in joints if _moves(data, joint, c.actuated))
     first = slice(len(names))  # legs, waist, arms, head: those that are held come last
     kp, effort = model.actuator_gainprm[first, 0], model.actuator_forcerange[first, 1]
     q0, ranges = rest[first], model.jnt_range[1:][first]
-    soles, ankles = _spheres(model), ("left_ankle_roll_link", "right_ankle_roll_link")
+    has = lambda kinds: np.array([any(kind in name for kind in kinds) for name in names])
     return Robot(
         joint_names=names,
         nominal_pose=q0.astype(np.float32),
@@ -101,17 +103,17 @@ def load(c: config.Robot) -> Robot:
         range_low=ranges[:, 0].astype(np.float32),
         range_high=ranges[:, 1].astype(np.float32),
         action_scale=(c.action_scale * effort / kp).astype(np.float32),
-        hip_xz=np.array(["hip_roll" in name or "hip_yaw" in name for name in names]),
-        ankle_x=np.array(["ankle_roll" in name for name in names]),
+        hip_xz=has(data.hip_xz),
+        ankle_x=has(data.ankle_x),
         mass=float(model.body_mass.sum()),
-        standing_height=_standing_height(model, rest),
-        pelvis=model.body("pelvis").id,
-        trunk=int(model.geom("torso_link_left").bodyid[0]),
-        ankles=(model.body(ankles[0]).id, model.body(ankles[1]).id),
-        spheres=soles,
-        capsules=_capsules(model),
-        camera=_mount(model, "depth_camera"),
-        imu=_mount(model, "imu"),
+        standing_height=_standing_height(model, rest, data),
+        pelvis=model.body(data.base).id,
+        trunk=int(model.geom(data.trunk).bodyid[0]),
+        ankles=(model.body(data.feet[0]).id, model.body(data.feet[1]).id),
+        spheres=_spheres(model, data),
+        capsules=_capsules(model, data),
+        camera=_mount(model, data.camera),
+        imu=_mount(model, data.imu),
     )
 
 
@@ -121,20 +123,29 @@ def moving(c: config.Robot) -> Actuated:
 
 
 def spec(
-    moves: Actuated, physics: config.Physics, contact_planes: int = 1, visual: bool = False
+    moves: Actuated,
+    physics: config.Physics,
+    contact_planes: int = 1,
+    visual: bool = False,
+    name: str = config.Robot.name,
 ) -> mujoco.MjSpec:
-    """Return the model in which only the joints of `moves` do.
+    """Build the model of the robot `name` in which only the joints of `moves` move.
 
     The others are welded at the nominal pose, and links that no joint moves any more are fused
     with their parent. Each contact sphere gets `contact_planes` mocap bodies, each with a plane
     that only this sphere collides with: the caller keeps it tangent to the ground. Body, geom and
     pair have the name `plane_{sphere}_{k}`; the mocap bodies come in the order sphere, then k.
     Without `visual`, the shapes that take no part in the physics are left out.
+
+    Raises:
+        ConfigError: there is no such robot, or its MJCF does not keep the conventions.
     """
-    s = mujoco.MjSpec.from_file(str(XML))
+    data = describe(name)
+    s = mujoco.MjSpec.from_file(str(data.xml))
+    check_conventions(s, data)
     for joint in s.joints[1:]:
-        if not _moves(joint.name, moves):
-            _weld(s, joint)
+        if not _moves(data, joint.name, moves):
+            _weld(s, joint, data.nominal_angle(joint.name))
     s.compiler.fusestatic = True
     s.option.timestep = physics.timestep
     s.option.iterations = physics.iterations
@@ -154,14 +165,14 @@ def spec(
     return s
 
 
-def add_force_sensors(spec: mujoco.MjSpec) -> None:
+def add_force_sensors(spec: mujoco.MjSpec, name: str = config.Robot.name) -> None:
     """Add sensors of the net contact force that each foot exerts, in the world frame."""
-    for side in ("left", "right"):
+    for foot in describe(name).feet:
         spec.add_sensor(
-            name=f"{side}_foot_force",
+            name=f"{foot}_force",
             type=mujoco.mjtSensor.mjSENS_CONTACT,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
-            objname=f"{side}_ankle_roll_link",
+            objname=foot,
             intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],  # net force
         )
 
@@ -175,18 +186,17 @@ def solve_sparsely(spec: mujoco.MjSpec) -> None:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
 
 
-def _moves(joint: str, those: Actuated) -> bool:
+def _moves(data: Description, joint: str, those: Actuated) -> bool:
     """Return whether the joint of this name is one of those."""
-    parts = joint.split("_")
     if those == "all":
         return True
-    return parts[1] in LEG_JOINTS or (those == "legs+waist" and parts[0] == "waist")
+    return data.is_leg(joint) or (those == "legs+waist" and data.is_waist(joint))
 
 
-def _weld(s: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
-    """Fix a hinge at its nominal angle: turn its body there, then take it and its motor away."""
+def _weld(s: mujoco.MjSpec, joint: mujoco.MjsJoint, angle: float) -> None:
+    """Fix a hinge at an angle, rad: turn its body there, then take it and its motor away."""
     body, turn, turned = joint.parent, np.zeros(4), np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, joint.axis, x2_ultra.nominal_angle(joint.name))
+    mujoco.mju_axisAngle2Quat(turn, joint.axis, angle)
     mujoco.mju_mulQuat(turned, body.quat, turn)
     body.quat = turned
     s.delete(s.actuator(joint.name))
@@ -213,30 +223,36 @@ def _add_plane(s: mujoco.MjSpec, sphere: str, name: str) -> None:
     )
 
 
-def _standing_height(model: mujoco.MjModel, q0: Float[np.ndarray, " M"]) -> float:
-    """Return the height of the pelvis over the lowest point of the soles at q0, m."""
+def _standing_height(
+    model: mujoco.MjModel, q0: Float[np.ndarray, " M"], data: Description
+) -> float:
+    """Compute the height of the base over the lowest point of the soles at q0, m."""
     state = mujoco.MjData(model)
     state.qpos[:7], state.qpos[7:] = (0, 0, 0, 1, 0, 0, 0), q0
     mujoco.mj_kinematics(model, state)
-    soles = [g for g in range(model.ngeom) if "sole" in model.geom(g).name]
+    soles = [g for g in range(model.ngeom) if model.geom(g).name.startswith(data.soles)]
     return -float((state.geom_xpos[soles, 2] - model.geom_size[soles, 0]).min())
 
 
-def _spheres(model: mujoco.MjModel) -> Spheres:
+def _spheres(model: mujoco.MjModel, data: Description) -> Spheres:
     """Read the contact spheres, in the model's order."""
     ids = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
     names = tuple(model.geom(i).name for i in ids)
-    foot = {"left_sole": 0, "right_sole": 1}
     return Spheres(
         names=names,
         body=model.geom_bodyid[ids].astype(np.int32),
         position=model.geom_pos[ids].astype(np.float32),
         radius=model.geom_size[ids, 0].astype(np.float32),
-        foot=np.array([foot.get(name.rpartition("_")[0], -1) for name in names], np.int32),
+        foot=np.array([_foot_of(name, data) for name in names], np.int32),
     )
 
 
-def _capsules(model: mujoco.MjModel) -> Capsules:
+def _foot_of(sphere: str, data: Description) -> int:
+    """Return 0 for a sphere under the left sole, 1 under the right one, -1 elsewhere."""
+    return next((k for k, sole in enumerate(data.soles) if sphere.startswith(sole)), -1)
+
+
+def _capsules(model: mujoco.MjModel, data: Description) -> Capsules:
     """Read the capsules of the links, in the model's order."""
     ids = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE)
     names = tuple(model.geom(i).name for i in ids)
@@ -251,8 +267,8 @@ def _capsules(model: mujoco.MjModel) -> Capsules:
         start=(model.geom_pos[ids] - half).astype(np.float32),
         end=(model.geom_pos[ids] + half).astype(np.float32),
         radius=model.geom_size[ids, 0].astype(np.float32),
-        in_view=has(IN_VIEW),
-        kept_clear=has(KEPT_CLEAR),
+        in_view=has(data.in_view),
+        kept_clear=has(data.kept_clear),
     )
 
 

@@ -42,11 +42,11 @@ class WholeBodySim:
             ConfigError: the ground needs too many boxes.
         """
         self.config, self.ground = c, ground
-        self.robot = robot.load(config.Robot(actuated="all"))
+        self.robot = robot.load(config.Robot(c.robot.name, actuated="all"))
         self.model = model = _spec(c, ground, self.robot, friction).compile()
         names = self.robot.joint_names
         self.driven = np.array([names.index(name) for name in joints])
-        self.feet = [model.body(f"{side}_ankle_roll_link").id for side in ("left", "right")]
+        self.feet = list(self.robot.ankles)
         self.rays = _rays(c.camera)
         clear = np.array(self.robot.capsules.names)[self.robot.capsules.kept_clear]
         self.kept_clear = {model.geom(name).id for name in clear}
@@ -102,7 +102,7 @@ def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
 
 def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> mujoco.MjSpec:
     """Return robot and ground; rays meet the ground and the links that training renders."""
-    spec = robot.spec("all", c.physics, contact_planes=0, visual=True)
+    spec = robot.spec("all", c.physics, contact_planes=0, visual=True, name=c.robot.name)
     capsules = whole.capsules
     in_view = {n for n, yes in zip(capsules.names, capsules.in_view, strict=True) if yes}
     clear = {n for n, yes in zip(capsules.names, capsules.kept_clear, strict=True) if yes}
@@ -113,5 +113,5 @@ def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> muj
         geom.contype = int(touches or geom.name in solid)
         geom.friction = [friction, 0.005, 0.0001]
     ground.add_to(spec, friction)
-    robot.add_force_sensors(spec)
+    robot.add_force_sensors(spec, c.robot.name)
     return spec

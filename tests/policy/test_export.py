@@ -12,7 +12,7 @@ from cref_jax import config, deploy, robot
 from cref_jax.errors import ConfigError
 from cref_jax.policy import reader, reference_vectors, sources, writer
 from cref_jax.policy.manifest import build_manifest
-from cref_jax.robot import x2_ultra
+from cref_jax.robot.x2_ultra import X2_ULTRA
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def test_the_manifest_says_what_the_engineer_needs():
     assert held == set(whole.joint_names) - set(ROBOT.joint_names)
     assert sum(term["size"] for term in manifest["observation"]["terms"]) == 9 + 3 * J
     assert len(manifest["observation"]["mean"]) == 9 + 3 * J
-    assert manifest["depth"]["mount"]["link"] in x2_ultra.XML.read_text()
+    assert manifest["depth"]["mount"]["link"] in X2_ULTRA.xml.read_text()
     assert manifest["rates"] == {"control_hz": 50.0, "depth_hz": 20.0, "frame_age_s": 0.02}
     json.dumps(manifest, allow_nan=False)
 

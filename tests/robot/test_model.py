@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cref_jax import config, robot
-from cref_jax.robot import x2_ultra
+from cref_jax.robot.x2_ultra import X2_ULTRA
 
 FACTS = json.loads((Path(__file__).parents[1] / "data" / "x2_facts.json").read_text())
 ACTUATED = ["legs", "legs+waist", "all"]
@@ -14,7 +14,7 @@ ACTUATED = ["legs", "legs+waist", "all"]
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_path(str(x2_ultra.XML))
+    return mujoco.MjModel.from_xml_path(str(X2_ULTRA.xml))
 
 
 def mean_of_sides(values: dict[str, float], name: str) -> float:

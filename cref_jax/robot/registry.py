@@ -1,0 +1,21 @@
+"""The robots that there are: one line per robot."""
+
+from cref_jax.config import unknown
+from cref_jax.errors import ConfigError
+from cref_jax.robot.description import Description
+from cref_jax.robot.x2_ultra import X2_ULTRA
+
+ROBOTS = {
+    "x2_ultra": X2_ULTRA,
+}
+
+
+def describe(name: str) -> Description:
+    """Return the data of a robot by the name that settings give it.
+
+    Raises:
+        ConfigError: there is no such robot.
+    """
+    if name not in ROBOTS:
+        raise ConfigError(unknown("robot", name, list(ROBOTS)))
+    return ROBOTS[name]
