@@ -30,21 +30,40 @@ class Observation(NamedTuple):
     velocity: Float[Array, "3"]  # m/s, the velocity estimator's target
 
 
+class Part(NamedTuple):
+    """A part of o^p_t."""
+
+    name: str
+    size: int  # numbers; 0: one per joint
+    unit: str
+    frame: str
+
+
+BASE = "base: x forward, y left, z up"
+PARTS = (  # Eq. 2, in its order
+    Part("angular_velocity", 3, "rad/s", BASE),
+    Part("gravity", 3, "unit vector; (0, 0, -1) upright", BASE),
+    Part("command", 3, "m/s forward, m/s to the left, rad/s to the left", BASE),
+    Part("joint_position", 0, "rad from default_rad", "joints"),
+    Part("joint_velocity", 0, "rad/s", "joints"),
+    Part("action", 0, "the clipped action of the step before; 0 at first", "joints"),
+)
+
+
 def slices(num_joints: int) -> dict[str, slice]:
-    """Return where each part of o^p_t lies, in the order of Eq. 2."""
-    widths = {
-        "angular_velocity": 3,
-        "gravity": 3,
-        "command": 3,
-        "joint_position": num_joints,
-        "joint_velocity": num_joints,
-        "previous_action": num_joints,
-    }
-    ends = np.cumsum(list(widths.values()))
+    """Return where each part of o^p_t lies."""
+    widths = [part.size or num_joints for part in PARTS]
+    ends = np.cumsum(widths).tolist()
     return {
-        name: slice(int(end) - width, int(end))
-        for (name, width), end in zip(widths.items(), ends, strict=True)
+        part.name: slice(end - width, end)
+        for part, width, end in zip(PARTS, widths, ends, strict=True)
     }
+
+
+def num_joints_of(size: int) -> int:
+    """Return the number of joints of an o^p_t with `size` numbers."""
+    fixed = sum(part.size for part in PARTS)
+    return (size - fixed) // sum(part.size == 0 for part in PARTS)
 
 
 def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"], joints: int) -> Motion:
@@ -84,16 +103,15 @@ def proprioception(
     previous_action: Float[Array, " J"],
 ) -> Float[Array, " O"]:
     """o^p_t = [omega, r_grav, u_cmd, q - q_0, dq/dt, a_{t-1}], Eq. 2."""
-    return jnp.concatenate(
-        [
-            sensed.angular_velocity,
-            sensed.gravity,
-            command,
-            sensed.joint_position - nominal_pose,
-            sensed.joint_velocity,
-            previous_action,
-        ]
-    )
+    values = {
+        "angular_velocity": sensed.angular_velocity,
+        "gravity": sensed.gravity,
+        "command": command,
+        "joint_position": sensed.joint_position - nominal_pose,
+        "joint_velocity": sensed.joint_velocity,
+        "action": previous_action,
+    }
+    return jnp.concatenate([values[part.name] for part in PARTS])
 
 
 def height_scan(

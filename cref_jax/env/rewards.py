@@ -1,8 +1,9 @@
-"""Table I: one pure function a row. The weight and the log key have the function's name.
+"""Table I: one pure function per row. The weight and the log key have the function's name.
 
 A function is the paper's expression; its sign and size are in the weight (config.RewardWeights).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -44,6 +45,13 @@ class Snapshot(NamedTuple):
 
 
 Term = Callable[[Snapshot, config.Reward, Robot], Float[Array, ""]]
+_EVENTS: set[Term] = set()
+
+
+def at_touchdown(term: Term) -> Term:
+    """Mark a term that is nonzero only in the step of a touchdown; see `total`."""
+    _EVENTS.add(term)
+    return term
 
 
 def is_standing(command: Float[Array, "3"], c: config.Reward) -> Bool[Array, ""]:
@@ -97,11 +105,13 @@ def feet_y_distance(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array,
     return jnp.exp(-10.0 * jnp.abs(s.feet_y - c.feet_y_target))
 
 
+@at_touchdown
 def foothold_placement(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """Sum over feet of I_td exp(-d_xz / s_xz), Sec. II-C; 0 for a foot without a candidate."""
     return jnp.sum(s.first_contact * jnp.exp(-s.foothold_distance / c.foothold_tolerance))
 
 
+@at_touchdown
 def foothold_missed(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """Sum over feet of I_td (1 - exp(-d_xz / s_xz)), 0 without a candidate; not in Table I.
 
@@ -147,11 +157,13 @@ def action_smoothness(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Arra
     return jnp.square(s.action - 2.0 * s.action_1 + s.action_2).sum()
 
 
+@at_touchdown
 def feet_air_time(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """Sum over feet of I_first (0.5 - T_air)."""
     return jnp.sum(s.first_contact * (c.air_time_target - s.air_time))
 
 
+@at_touchdown
 def air_time_variance(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     """I_first of any foot times the variance of the feet's last air times, s^2; not in Table I.
 
@@ -213,38 +225,9 @@ def stumble(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
 
 
 TERMS: dict[str, Term] = {
-    f.__name__: f
-    for f in (
-        linear_velocity_tracking,
-        angular_velocity_tracking,
-        orientation,
-        feet_contact,
-        feet_y_distance,
-        foothold_placement,
-        foothold_missed,
-        foot_contact_quality,
-        base_height,
-        linear_velocity_z,
-        angular_velocity_xy,
-        joint_velocity,
-        action_rate,
-        action_smoothness,
-        feet_air_time,
-        air_time_variance,
-        foot_up_when_standing,
-        foot_slip,
-        foot_impact_acceleration,
-        foot_impact_velocity,
-        joint_position_limits,
-        joint_velocity_limits,
-        hip_position,
-        ankle_position,
-        stumble,
-    )
+    weight.name: globals()[weight.name] for weight in dataclasses.fields(config.RewardWeights)
 }
-
-# not 0 in the step of a touchdown alone
-EVENTS = ("foothold_placement", "foothold_missed", "feet_air_time", "air_time_variance")
+EVENTS = tuple(name for name, term in TERMS.items() if term in _EVENTS)
 
 
 def total(

@@ -10,6 +10,7 @@ import numpy as np
 
 from cref_jax import config, deploy, ppo, robot
 from cref_jax.config import Config
+from cref_jax.env import observations
 from cref_jax.policy.trained import TrainedPolicy
 
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
@@ -81,17 +82,8 @@ def _action(c: Config) -> dict[str, Any]:
 
 def _observation(train: ppo.TrainState, driven: robot.Robot) -> dict[str, Any]:
     joints, statistics = len(driven.joint_names), train.statistics.obs
-    base = "base: x forward, y left, z up"
-    terms = [
-        ("angular_velocity", 3, "rad/s", base),
-        ("gravity", 3, "unit vector; (0, 0, -1) upright", base),
-        ("command", 3, "m/s forward, m/s to the left, rad/s to the left", base),
-        ("joint_position", joints, "rad from default_rad", "joints"),
-        ("joint_velocity", joints, "rad/s", "joints"),
-        ("action", joints, "the clipped action of the step before; 0 at first", "joints"),
-    ]
     return {
-        "terms": [dict(zip(("name", "size", "unit", "frame"), t, strict=True)) for t in terms],
+        "terms": [part._replace(size=part.size or joints)._asdict() for part in observations.PARTS],
         "formula": "clip((x - mean) / std, -clip, clip)",
         "mean": [float(x) for x in np.asarray(statistics.mean, np.float32)],
         "std": [float(x) for x in np.asarray(statistics.std, np.float32)],

@@ -76,8 +76,7 @@ def body(state: Body, of: Joints) -> Body:
 
 def proprioception(seen: Float[Array, "*n O"], of: Joints) -> Float[Array, "*n O"]:
     """Return M o^p: what the robot's mirror image senses."""
-    count = (seen.shape[-1] - 9) // 3
-    where = observations.slices(count)
+    where = observations.slices(observations.num_joints_of(seen.shape[-1]))
     signs = {"angular_velocity": AXIAL, "gravity": POLAR, "command": COMMAND}
     parts = [
         signs[name] * seen[..., part] if name in signs else of.flipped(seen[..., part])

@@ -40,7 +40,7 @@ def test_the_parts_follow_each_other_as_in_eq_2():
         "command": [0.5, -0.1, 0.2],
         "joint_position": 0.01 * np.arange(JOINTS) - 0.5,
         "joint_velocity": np.arange(JOINTS),
-        "previous_action": 100.0 + np.arange(JOINTS),
+        "action": 100.0 + np.arange(JOINTS),
     }
     assert list(parts) == list(expected)
     for name, values in expected.items():

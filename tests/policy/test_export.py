@@ -88,6 +88,7 @@ def test_the_manifest_says_what_the_engineer_needs():
     whole = robot.load(config.Robot(actuated="all"))
     held = {joint["name"] for joint in manifest["held_joints"]}
     assert held == set(whole.joint_names) - set(ROBOT.joint_names)
+    assert [term["name"] for term in manifest["observation"]["terms"]] == list(deploy.TERMS)
     assert sum(term["size"] for term in manifest["observation"]["terms"]) == 9 + 3 * J
     assert len(manifest["observation"]["mean"]) == 9 + 3 * J
     assert manifest["depth"]["mount"]["link"] in X2_ULTRA.xml.read_text()

@@ -10,13 +10,14 @@ import numpy as np
 
 from cref_jax import config, network, ppo, robot
 from cref_jax.config import Config
+from cref_jax.env import observations
 from cref_jax.policy import reference_vectors, trained
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.training import pytree_digest
 
 ROBOT = robot.load(config.Robot())
 J = len(ROBOT.joint_names)
-OBS = 9 + 3 * J
+OBS = observations.slices(J)["action"].stop
 SMALL = config.Network(
     convolutions=((4, 4, 4), (8, 3, 2)),
     token=8, heads=2, compressed=4, lstm=6, gru=7, actor=(9, 5), critic=(4,),
