@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import config, deploy, depth, exported, terrain
+from cref_jax import config, deploy, depth, terrain
 from cref_jax.config import Camera, Config, ConfigError
+from cref_jax.policy import sources
 
 COMMANDS = (
     "train", "eval", "play", "export", "sim2sim", "report", "bench", "params", "gpu_program",
@@ -30,7 +31,7 @@ def step() -> terrain.Terrain:
 
 
 def bundled(name: str):
-    return exported.bundled().with_name(name)
+    return sources.bundled_policy().with_name(name)
 
 
 def test_the_ground_has_the_height_of_the_column_under_a_point(step):

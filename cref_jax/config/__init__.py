@@ -1,25 +1,10 @@
 """Every number of the program, and how a run changes them."""
 
+from cref_jax.config.learning import PPO, Network, Run, Variant
 from cref_jax.config.overrides import load_toml, override, unknown
-from cref_jax.config.settings import (
-    PPO,
-    Camera,
-    Command,
-    Config,
-    Curriculum,
-    Episode,
-    Foothold,
-    Network,
-    Physics,
-    Randomisation,
-    Reward,
-    RewardWeights,
-    Robot,
-    Run,
-    Scan,
-    Terrain,
-    Variant,
-)
+from cref_jax.config.settings import Config
+from cref_jax.config.simulation import Camera, Foothold, Physics, Robot, Scan, Terrain
+from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Reward, RewardWeights
 from cref_jax.errors import ConfigError
 
 __all__ = [

@@ -8,10 +8,8 @@ from pathlib import Path
 import pytest
 
 from cref_jax import config
-from cref_jax.config import Config, limits, settings
+from cref_jax.config import Config, limits
 from cref_jax.errors import ConfigError
-
-SOURCE = Path(settings.__file__).read_text()
 
 
 def test_changes_reach_nested_settings_and_leave_the_rest():

@@ -27,7 +27,7 @@ import pytest
 
 from cref_jax import train
 
-DATA = Path(__file__).parent / "data" / "checkpoint"
+DATA = Path(__file__).parents[1] / "data" / "checkpoint"
 TOLERANCE = 1e-3  # of the sum of magnitudes; without AVX-512 or optimisation it is 1e-5
 
 pytestmark = pytest.mark.slow
