@@ -37,7 +37,7 @@ BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the s
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Measure steps a second by stage, and how the engines compare."""
 
     terrain: str = "mixed"
@@ -55,8 +55,6 @@ class Options:
     """compare the depth camera with MuJoCo's ray-cast, too, and with NVIDIA Warp's if installed"""
     out: Path | None = None
     """write the figures as JSON, too"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Row(NamedTuple):

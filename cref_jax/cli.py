@@ -4,9 +4,28 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from cref_jax.errors import CheckpointError, ConfigError, TrainingError
+
+
+@dataclass(frozen=True)
+class DebugOption:
+    """The option that every command has."""
+
+    debug: bool = False
+    """show the traceback of an error"""
+
+
+@dataclass(frozen=True)
+class PolicyOptions(DebugOption):
+    """The options of a command that looks at one policy."""
+
+    run: Path | None = None
+    """runs/NAME (default: the newest run, or the bundled policy where there is none)"""
+    policy: Path | None = None
+    """an exported policy instead of a run"""
 
 
 @contextlib.contextmanager

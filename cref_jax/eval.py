@@ -1,4 +1,4 @@
-"""Judge a policy: `python -m cref_jax.eval --suite table`."""
+"""Evaluate a policy: `python -m cref_jax.eval --suite table`."""
 
 import cref_jax.system.startup  # noqa: F401
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import tyro
@@ -33,6 +33,7 @@ from cref_jax.pages import evaluation_page
 from cref_jax.physics.records import EngineName
 from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.system import jax_setup, parallel
+from cref_jax.terrain.generators import KINDS
 from cref_jax.training import run_dir
 
 Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
@@ -40,44 +41,39 @@ PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Measure how a trained policy walks."""
 
     run: tuple[Path, ...] = ()
-    """runs/NAME; the newest one when left out, or the bundled policy where there is none; of
-    several, such as seeds of one training, the table pools the trials"""
+    """runs/NAME (default: the newest run, or the bundled policy where there is none); with several,
+    such as seeds of one training, the table pools their trials"""
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
     suite: Suite = "table"
     """table: the twelve cells of Table II and the failures of Table III; robust: the same with
-    masses, friction, motors, delays, sensors, pushes and the camera's mount randomised, and with
-    each of these alone; ood: twenty scenes in
-    MuJoCo C that nobody was trained on, by the numpy runtime; cross: trials on lanes with obstacles
-    of one size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; commands: to stand, walk
-    at each speed, go aside, turn and stop on flat ground"""
-    kind: str = "gap"
-    """of the obstacles to cross: gap, stairs_up, stairs_down, platform, rough, slope, flat"""
+    masses, friction, motors, delays, sensors, pushes and camera mount randomised, and with each of
+    these alone; ood: twenty scenes outside the training distribution, in MuJoCo C by the numpy
+    runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
+    to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping"""
+    kind: Annotated[str, tyro.conf.arg(help=f"kind of lane to cross: {', '.join(KINDS)}")] = "gap"
     size: float = 0.3
-    """of the obstacles to cross, m; of a slope its gradient"""
+    """size of the obstacles, m; for a slope its gradient"""
     num_envs: int | None = None
-    """trials of each cell, or episodes; when left out 100 on a CPU and 2000 on an accelerator; of
-    each scene 10"""
+    """trials per cell, or episodes (default: 100 on a CPU, 2000 on an accelerator; 10 per scene)"""
     stress: int = 2
-    """trials of each scene under each condition: lost, late and partly blind frames, friction"""
+    """trials per scene under each condition: lost, late and partly blind frames, friction"""
     film: str | None = None
-    """film one trial in this scene instead of judging in all of them: SCENE.mp4"""
+    """film one trial in this scene instead of evaluating in all: SCENE.mp4"""
     seed: int = 0
-    """of the first states and commands"""
+    """seed of initial states and commands"""
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx and warp on the device"""
     out: Path | None = None
-    """folder for eval.json and eval.html; the run's own when left out, or the present one"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """folder for eval.json and eval.html (default: the run's, or the current one)"""
 
 
 class Subject(NamedTuple):
-    """A policy to judge."""
+    """A policy to evaluate."""
 
     source: Path
     policy: trained.TrainedPolicy

@@ -15,20 +15,18 @@ from cref_jax.training import run_dir
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Write a trained policy as a directory that numpy alone can run."""
 
     run: Path | None = None
-    """runs/NAME, or what --learner wrote; the newest run when left out"""
+    """runs/NAME, or a file that --learner wrote (default: the newest run)"""
     out: Path = Path("policy")
-    """the directory; the same as one file is written to the directory's name with .zip"""
+    """directory to write; a .zip of the same name is written beside it"""
     learner: Path | None = None
-    """write all that was learned, the critic and the optimiser too, to this .npz instead: to go on
-    with elsewhere, by --init"""
+    """write everything that was learned, critic and optimizer included, to this .npz instead, to
+    continue elsewhere with --init"""
     refresh: bool = False
-    """only give the policy that is there the runtime of this version"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """only update the runtime of the policy in --out to this version"""
 
 
 def main(arguments: list[str] | None = None) -> None:

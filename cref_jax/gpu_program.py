@@ -89,7 +89,7 @@ CARDS = {
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Compile the training program for a GPU, without one, and estimate its time."""
 
     gpu: Literal["h100", "a100", "4090"] = "h100"
@@ -98,8 +98,6 @@ class Options:
     """what the robots stand on"""
     num_envs: int | None = None
     """robots at once; as in `make train` on a GPU when left out"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Stage(NamedTuple):

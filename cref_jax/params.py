@@ -15,11 +15,8 @@ from cref_jax.training import iteration
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Count the parameters of each variant, by part."""
-
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 def main(arguments: list[str] | None = None) -> None:

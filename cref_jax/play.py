@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from cref_jax.rendering import policy_overlay, robot_scene, video
 from cref_jax.system import jax_setup
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import rollout
 
 T = TypeVar("T")
@@ -56,33 +57,31 @@ ENDINGS = {  # of an episode, by its name in episode.Ending
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.PolicyOptions):
     """Let one robot walk along a lane, without noise or pushes, and film it."""
 
-    run: Path | None = None
-    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
-    policy: Path | None = None
-    """an exported policy instead of a run"""
     agent: Agent = "trained"
     """trained: a policy; stand: hold the nominal pose; random: the noise of an untrained policy"""
-    terrain: str | None = None
-    """flat, rough, slope, stairs, gap, platform, mixed, or a height map; the run's when left out"""
+    terrain: Annotated[
+        str | None,
+        tyro.conf.arg(
+            help=f"{', '.join(terrain_names())}, or a height map (default: the run's own)"
+        ),
+    ] = None
     kind: str | None = None
-    """kind of lane, such as stairs_down; the terrain's first when left out"""
+    """kind of lane, such as stairs_down (default: the terrain's first)"""
     level: Level | None = None
-    """0 (easiest) to 9, or the name of a size of Table II; the middle one when left out"""
+    """0 (easiest) to 9, or the name of a size of Table II (default: the middle one)"""
     command: float = 0.6
     """m/s forward"""
     seconds: float = 10.0
-    """length; it ends earlier where the robot falls or the lane ends"""
+    """length of the film; it ends earlier where the robot falls or the lane ends"""
     seed: int = 0
-    """of the first state and of the random agent"""
+    """seed of the initial state and of the random agent"""
     stills: int = 0
-    """write a picture of so many moments side by side instead of a video"""
+    """write N stills side by side instead of a video"""
     out: Path | None = None
-    """.mp4, or .png for stills; play.mp4 in the folder of the run when left out"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """.mp4, or .png for stills (default: play.mp4 in the run's folder)"""
 
 
 class Recording(NamedTuple):

@@ -16,17 +16,11 @@ from cref_jax.policy import sources
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.PolicyOptions):
     """Write one self-contained page about a run or an exported policy."""
 
-    run: Path | None = None
-    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
-    policy: Path | None = None
-    """an exported policy instead of a run"""
     out: Path | None = None
-    """the page, .html; report.html in the folder of the run when left out, or policy.html here"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """page to write, .html (default: report.html in the run's folder, or policy.html here)"""
 
 
 def main(arguments: list[str] | None = None) -> None:

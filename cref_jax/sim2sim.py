@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -26,6 +26,7 @@ from cref_jax.policy import reader, sources
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene, video
 from cref_jax.system import jax_setup, parallel
+from cref_jax.terrain.generators import KINDS
 from cref_jax.whole_body.disturbances import Disturbance
 from cref_jax.whole_body.ground import Lane
 from cref_jax.whole_body.simulator import WholeBodySim
@@ -36,31 +37,28 @@ SIZE = (960, 540)  # pixels of it
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(cli.DebugOption):
     """Let an exported policy walk all 31 joints in MuJoCo C, through deploy.py alone."""
 
     policy: Path | None = None
-    """what `python -m cref_jax.export` wrote, or its .zip; the bundled policy when left out"""
-    kind: str = "flat"
-    """of the lane: flat, gap, stairs_up, stairs_down, platform, rough, slope"""
+    """what `python -m cref_jax.export` wrote, or its .zip (default: the bundled policy)"""
+    kind: Annotated[str, tyro.conf.arg(help=f"kind of lane: {', '.join(KINDS)}")] = "flat"
     size: float = 0.0
-    """of the obstacles, m; of a slope its gradient"""
+    """size of the obstacles, m; for a slope its gradient"""
     trials: int = 100
-    """of up to 40 s"""
+    """number of trials, each of up to 40 s"""
     seed: int = 0
-    """of the first states and commands, which are those of `eval --suite cross`"""
+    """seed of initial states and commands, the same as in `eval --suite cross`"""
     latency: float = 0.02
-    """s from a frame's exposure until the policy has it"""
+    """s from the exposure of a frame until the policy has it"""
     compare: bool = False
-    """evaluate the same trials in the training simulation, too"""
+    """also evaluate the same trials in the training simulation"""
     table: bool = False
-    """flat ground and each cell of Table II, with --compare; so many trials each"""
+    """run --trials on flat ground and in each cell of Table II, with --compare"""
     out: Path | None = None
-    """file for the results, .json"""
+    """results, .json"""
     film: Path | None = None
-    """file for a film of the first trial, .mp4"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """film of the first trial, .mp4"""
 
 
 def main(arguments: list[str] | None = None) -> None:

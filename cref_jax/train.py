@@ -22,6 +22,7 @@ from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.policy import learner_file, sources, trained, warm_start
 from cref_jax.system import jax_setup, parallel
+from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import devices, iteration, run_dir, trainer
 from cref_jax.training.checkpoint import Checkpoints, lock
 from cref_jax.training.progress import Reporter
@@ -34,17 +35,19 @@ Device = Literal["auto", "cpu", "gpu"]
 
 
 @dataclass(frozen=True)
-class Options:
-    """What is asked for besides the settings of the run."""
+class Options(cli.DebugOption):
+    """Options besides the settings of the run."""
 
-    terrain: str = "flat"
-    """flat, rough, slope, stairs, gap, platform, mixed, or a height map: path.npy, path.png"""
+    terrain: Annotated[
+        str,
+        tyro.conf.arg(help=f"{', '.join(terrain_names())}, or a height map: path.npy, path.png"),
+    ] = "flat"
     experiment: str | None = None
     """a file in experiments/ (without .toml) or a path: differences from the defaults"""
     num_envs: int | None = None
-    """robots at once; short for --run.num-envs"""
+    """environments; short for --run.num-envs"""
     iterations: int | None = None
-    """iterations in all; short for --run.iterations"""
+    """total iterations; short for --run.iterations"""
     seed: int | None = None
     """short for --run.seed"""
     engine: EngineName = "auto"
@@ -52,22 +55,20 @@ class Options:
     device: Device = "auto"
     """where the program runs; gpu is an error without one"""
     devices: int | None = None
-    """how many share the robots; as many as there are when left out, and of a CPU one a core"""
+    """devices to shard the environments over (default: all; one per CPU core)"""
     run_dir: Path | None = None
-    """where everything is written; runs/TERRAIN-EXPERIMENT-DATE when left out"""
+    """folder of the run (default: runs/TERRAIN-EXPERIMENT-DATE)"""
     init: Path | None = None
-    """a run, what it has learned (export --learner), or an exported policy, as which this run
-    begins; without a critic, or with another, the critic learns alone first"""
+    """begin as this run, learner file (export --learner) or exported policy; where it has no critic
+    of this network, the critic learns alone first"""
     resume: bool = False
-    """go on with the run in --run-dir, or with the newest one"""
+    """continue the run in --run-dir, or the newest one"""
     print_config: bool = False
     """print every setting as JSON and stop"""
     evaluate: bool = True
-    """let the policy walk 100 episodes at the end"""
+    """evaluate 100 episodes on flat ground at the end"""
     tensorboard: bool = True
-    """write TensorBoard files, too"""
-    debug: bool = False
-    """show the traceback of an error"""
+    """write TensorBoard files"""
 
 
 @dataclass(frozen=True)

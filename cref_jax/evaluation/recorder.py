@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from rich.progress import Progress
 
-from cref_jax import config, network, ppo
+from cref_jax import cli, config, network, ppo
 from cref_jax.config import Config
 from cref_jax.env.environment import Outcome
 from cref_jax.env.world import World, build_world, make_world
@@ -41,19 +41,17 @@ ON_CPU = 64  # robots, where nobody says how many; assumed: a minute of a CPU
 
 
 @dataclass(frozen=True)
-class Options:
-    """What is asked of every laboratory."""
+class Options(cli.DebugOption):
+    """The options of every laboratory."""
 
     command: float = 0.6
     """m/s forward"""
     num_envs: int | None = None
-    """robots; when left out 64 on a CPU, and hundreds or thousands on an accelerator"""
+    """robots (default: 64 on a CPU, hundreds or thousands on an accelerator)"""
     seed: int = 0
-    """of the first states"""
+    """seed of the initial states"""
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx and warp on the device"""
-    debug: bool = False
-    """show the traceback of an error"""
 
 
 class Moment(NamedTuple):

@@ -13,6 +13,11 @@ from cref_jax.errors import ConfigError
 from cref_jax.terrain.generators import KINDS, Range
 
 
+def terrain_names() -> list[str]:
+    """Return the names of the files in `terrains/`."""
+    return sorted(path.stem for path in folders.data_folder("terrains").glob("*.toml"))
+
+
 @dataclass(frozen=True)
 class _Levels:
     """The sizes of one kind in Table II, m."""
@@ -90,7 +95,7 @@ def _table(name: str) -> tuple[dict[str, Any], str]:
     """Return the tables and the file name of a terrain, named or given by its file."""
     path = Path(name)
     if path.suffix != ".toml":
-        known = sorted(path.stem for path in folders.data_folder("terrains").glob("*.toml"))
+        known = terrain_names()
         if name not in known:
             raise _unknown("terrain", name, known)
         path = folders.data_folder("terrains") / f"{name}.toml"
