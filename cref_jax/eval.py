@@ -114,7 +114,7 @@ def _sources(options: Options) -> list[Path]:
         raise ConfigError("give --run or --policy, not both")
     if options.film and options.suite != "ood":
         raise ConfigError("--film takes a scene of --suite ood; a lane is filmed by cref_jax.play")
-    given = [*options.run, *options.policy]
+    given = [*options.run, *map(sources.find_policy, options.policy)]
     if len(given) > 1 and options.suite != "table":
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
     return given or [sources.resolve_policy(None, None)]

@@ -9,24 +9,24 @@ import tyro
 
 from cref_jax import cli, deploy
 from cref_jax.env.world import build_world
-from cref_jax.policy import learner_file, trained, writer
+from cref_jax.policy import learner_file, sources, trained, writer
 from cref_jax.system import jax_setup
 from cref_jax.training import run_dir
 
 
 @dataclass(frozen=True)
-class Options(cli.DebugOption):
+class Options(cli.PolicyOptions):
     """Write a trained policy as a directory that numpy alone can run."""
 
     run: Path | None = None
     """runs/NAME, or a file that --learner wrote (default: the newest run)"""
+    policy: Path | None = None
+    """an exported policy, or `mixed` or `robust`, to write again with this version's runtime"""
     out: Path = Path("policy")
     """directory to write; a .zip of the same name is written beside it"""
     learner: Path | None = None
     """write everything that was learned, critic and optimizer included, to this .npz instead, to
     continue elsewhere with --init"""
-    refresh: bool = False
-    """only update the runtime of the policy in --out to this version"""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -39,13 +39,13 @@ def main(arguments: list[str] | None = None) -> None:
                 options.run or run_dir.newest(), cli.writable(options.learner, ".npz", "--learner")
             )
             return
-        if options.refresh:
-            writer.refresh(options.out)
+        if options.policy:
+            writer.copy(sources.resolve_policy(options.run, options.policy), options.out)
         else:
             _export(options)
         times = deploy.self_test(options.out)
         size = sum(file.stat().st_size for file in options.out.iterdir()) / 1e6
-        print(f"{options.out}: {size:.1f} MB, and says what it said in training")
+        print(f"{options.out}: {size:.1f} MB; outputs match the trained network")
         print("\n".join(deploy.report(times)))
         print(f"on the robot: python {options.out}/cref_runtime.py --selftest {options.out}")
 

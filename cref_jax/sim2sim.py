@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise ConfigError(f"--film must end in .mp4: {options.film}")
         if options.film and options.table:
             raise ConfigError("--film goes with one --kind, not with --table")
-        path = options.policy or sources.bundled_policy()
+        path = sources.find_policy(options.policy or sources.bundled_policy())
         policy = reader.read(path)
         physics = build_world(policy.config, "mujoco").physics
         record = (_table if options.table else _one)(policy, path, physics, options)

@@ -110,11 +110,13 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
     command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
-    c = _with_short_options(command.settings, command.options)
-    if command.options.init:
-        c = _with_init(c, command.options)
+    init = command.options.init and sources.find_policy(command.options.init)
+    options = dataclasses.replace(command.options, device=options.device, init=init)
+    c = _with_short_options(command.settings, options)
+    if init:
+        c = _with_init(c, options)
     limits.check(c)
-    return dataclasses.replace(command.options, device=options.device), c
+    return options, c
 
 
 def _options(arguments: list[str]) -> Options:

@@ -45,7 +45,9 @@ def main() -> None:
     for window in options.windows:
         with tempfile.TemporaryDirectory() as folder:
             path = with_window(
-                options.policy or sources.bundled_policy(), window, Path(folder) / "policy"
+                sources.find_policy(options.policy or sources.bundled_policy()),
+                window,
+                Path(folder) / "policy",
             )
             found = scene_suite.run_scenes(path, options.trials, 0, options.seed, scenes=scenes)
         counts = [scene.successes for scene in found.scenes]

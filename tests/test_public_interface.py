@@ -31,7 +31,7 @@ def step() -> terrain.Terrain:
 
 
 def bundled(name: str):
-    return sources.bundled_policy().with_name(name)
+    return sources.bundled_policy(name)
 
 
 def test_the_ground_has_the_height_of_the_column_under_a_point(step):

@@ -22,13 +22,19 @@ def resolve_policy(run: Path | None, policy: Path | None) -> Path:
     if run and policy:
         raise ConfigError("give --run or --policy, not both")
     with contextlib.suppress(ConfigError):
-        return run or policy or run_dir.newest()
+        return run or (policy and find_policy(policy)) or run_dir.newest()
     return bundled_policy()
 
 
-def bundled_policy() -> Path:
-    """Return the policy that comes with the package."""
-    return folders.data_folder("policies") / BUNDLED
+def bundled_policy(name: str = BUNDLED) -> Path:
+    """Return a policy that comes with the package."""
+    return folders.data_folder("policies") / name
+
+
+def find_policy(path: Path) -> Path:
+    """Return the path, or the bundled policy of this name where there is no such file."""
+    bundled = bundled_policy(str(path))
+    return bundled if not path.exists() and bundled.is_dir() else path
 
 
 def is_run(path: Path) -> bool:

@@ -41,18 +41,18 @@ def write(policy: TrainedPolicy, world: World, out: Path) -> None:
     _write(out, build_manifest(policy, world.physics.robot), files)
 
 
-def refresh(path: Path) -> None:
-    """Give an exported policy the runtime of this version; all else stays as it is.
+def copy(policy: Path, out: Path) -> None:
+    """Write an exported policy again with the runtime of this version; all else stays as it is.
 
     Raises:
-        ConfigError: it is no policy, or the disk refused.
+        ConfigError: it is no directory with a policy, or the disk refused.
     """
-    content, _ = reader.read_contents(path)
-    if not path.is_dir():
-        raise ConfigError(f"{path} is not a directory")
-    files = {name: (path / name).read_bytes() for name in content["files"]}
+    content, _ = reader.read_contents(policy)
+    if not policy.is_dir():
+        raise ConfigError(f"{policy} is not a directory")
+    files = {name: (policy / name).read_bytes() for name in ("weights.npz", "testvectors.npz")}
     files["cref_runtime.py"] = Path(deploy.__file__).read_bytes()
-    _write(path, content, files)
+    _write(out, content, files)
 
 
 def _write(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:

@@ -128,12 +128,28 @@ def test_the_bundled_policy_is_whole_and_small_enough():
     assert sum(file.stat().st_size for file in files) < 10e6
 
 
-@pytest.mark.parametrize("name", ["mixed", "robust"])
-def test_the_bundled_runtime_is_this_versions(name):
-    theirs = sources.bundled_policy().with_name(name) / "cref_runtime.py"
-    assert theirs.read_bytes() == Path(deploy.__file__).read_bytes()  # export --refresh mends it
+def test_an_exported_policy_is_written_again_with_this_versions_runtime(tmp_path):
+    writer.copy(sources.bundled_policy(), tmp_path / "policy")
+    runtime = (tmp_path / "policy" / "cref_runtime.py").read_bytes()
+    assert runtime == Path(deploy.__file__).read_bytes()
+    deploy.self_test(tmp_path / "policy.zip", rounds=1)
+    before, after = (
+        reader.read_contents(p)[0] for p in (sources.bundled_policy(), tmp_path / "policy")
+    )
+    changed = {"files", "digest"}
+    assert {k: v for k, v in before.items() if k not in changed} == {
+        k: v for k, v in after.items() if k not in changed
+    }
+
+
+def test_a_bundled_policy_is_found_by_its_name_where_there_is_no_such_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert sources.resolve_policy(None, Path("robust")) == sources.bundled_policy("robust")
+    assert sources.find_policy(Path("no such policy")) == Path("no such policy")
+    (tmp_path / "robust").mkdir()
+    assert sources.find_policy(Path("robust")) == Path("robust")
 
 
 @pytest.mark.parametrize("name", ["mixed", "robust"])  # one with a ray per pixel, one with windows
 def test_a_bundled_policy_says_what_it_said_in_training(name):
-    deploy.self_test(sources.bundled_policy().with_name(name))
+    deploy.self_test(sources.bundled_policy(name))
