@@ -11,7 +11,7 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
-.PHONY: help setup train eval play report export sim2sim bench gpu-program params test test-fast check format clean
+.PHONY: help $(shell sed -n "s/^\([a-z0-9-]*\):.*\#\# .*/\1/p" Makefile)
 
 help:
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' Makefile

@@ -1,11 +1,15 @@
 """The way of the data goes in one direction, and no file or function grows without a limit."""
 
 import ast
+import itertools
 import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
+
+from cref_jax.robot.registry import ROBOTS
 
 PACKAGE = Path(__file__).parents[1] / "cref_jax"
 FILES = sorted(PACKAGE.glob("**/*.py"))
@@ -20,9 +24,7 @@ FLOORS = [
     {"training", "whole_body"},
     {"policy", "benchmarks"},
     {"evaluation"},
-    {"train", "eval", "play", "bench", "gpu_program", "params", "export", "sim2sim", "report"},
 ]
-FLOOR = {name: number for number, floor in enumerate(FLOORS) for name in floor}
 
 WALLS = [  # a room, what it may not reach through any number of imports, and why
     ("ppo", ("env", "robot", "physics", "terrain", "brax"), "PPO knows nothing of robots"),
@@ -45,6 +47,10 @@ def dotted(path: Path) -> str:
 
 
 MODULES = {dotted(path): path for path in FILES}
+
+
+COMMANDS = {name for name, path in MODULES.items() if "__main__" in path.read_text()} - {"deploy"}
+FLOOR = {name: number for number, floor in enumerate([*FLOORS, COMMANDS]) for name in floor}
 
 
 def tree(name: str) -> ast.Module:
@@ -115,6 +121,16 @@ def test_walls(room_name, forbidden, why):
 def test_only_one_file_touches_mjx():
     users = [name for name in MODULES if any("mjx" in i.split(".") for i in imports(tree(name)))]
     assert users == ["physics.mjx_engine"]
+
+
+def test_only_the_robots_room_names_a_joint_or_a_body():
+    models = [mujoco.MjSpec.from_file(str(robot.xml)) for robot in ROBOTS.values()]
+    parts = [[*m.bodies, *m.joints, *m.geoms, *m.sites] for m in models]
+    names = {part.name for part in itertools.chain(*parts)} - {"", "world"}
+    assert "left_knee_joint" in names
+    for name in (name for name in MODULES if room(name) != "robot"):
+        constants = {n.value for n in ast.walk(tree(name)) if isinstance(n, ast.Constant)}
+        assert constants & names == set(), name
 
 
 def test_only_startup_changes_the_environment_when_it_is_imported():
