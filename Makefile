@@ -77,7 +77,7 @@ $(READY): pyproject.toml $(wildcard constraints-*.txt)
 	  exit 2; \
 	fi; \
 	[ -x $(BIN)/python ] || $$python -m venv $(VENV); \
-	extras=dev,play; \
+	extras=dev; \
 	driver=$$(nvidia-smi --query-gpu=driver_version --format=csv,noheader 2>/dev/null | head -1 | cut -d. -f1) \
 	  || driver=""; \
 	if [[ "$$driver" =~ ^[0-9]+$$ ]]; then \

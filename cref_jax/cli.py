@@ -1,4 +1,4 @@
-"""What the commands share: errors of one line, and files that can be written."""
+"""Shared by the commands: one-line errors and checks of output files."""
 
 import contextlib
 import os
@@ -30,9 +30,9 @@ class PolicyOptions(DebugOption):
 
 @contextlib.contextmanager
 def one_line_errors(debug: bool = False) -> Iterator[None]:
-    """Turn what a user can mend into one line on stderr and exit code 2; `debug` lets it through.
+    """Print errors a user can fix as one line on stderr and exit with 2; `debug` re-raises them.
 
-    Training that has gone wrong exits with 1, Ctrl-C with 130.
+    Failed training exits with 1, Ctrl-C with 130.
     """
     try:
         yield
@@ -44,11 +44,11 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.stdout.flush()
-        os._exit(130)  # at once: a running program may call into this interpreter until its end
+        os._exit(130)  # at once: a running XLA program may still call into this interpreter
 
 
-def writable(out: Path, suffix: str, option: str = "--out") -> Path:
-    """Return the file to write, its folder made.
+def prepare_output(out: Path, suffix: str, option: str = "--out") -> Path:
+    """Check that a file can be written, create its folder and return its path.
 
     Raises:
         ConfigError: its name does not end in `suffix`, or it cannot be written.

@@ -1,15 +1,15 @@
-"""The policy on a robot: one file, Python 3.8 and numpy 1.20 or newer, nothing else.
+"""Run a policy on a robot: one file that needs only Python 3.8 and numpy 1.20 or newer.
 
     policy = load("policy/", joints=names_in_the_robots_own_order)
     policy.reset()
-    policy.on_depth(frame, stamp)  # whenever the camera has a frame; any one thread
+    policy.on_depth(frame, stamp)  # for every camera frame; from any one thread
     target = policy.step(angular_velocity, gravity, command, q, qd, now)  # at 50 Hz
 
-`load` raises PolicyFormatError for whatever is not exactly a policy. Once it is loaded nothing
-raises: what is wrong with an input stands in `policy.status`, the last target is held for some
-steps, and from then on, until `reset`, the target is the measured pose, so that PD only damps.
+`load` raises PolicyFormatError unless the files are exactly a policy. After loading, no call
+raises: faults of an input are reported in `policy.status`, the last target is held for some steps,
+and after that, until `reset`, the target is the measured pose, so that PD only damps.
 
-On a machine with nothing but numpy: python cref_runtime.py --selftest policy/
+On a machine with only numpy: python cref_runtime.py --selftest policy/
 """
 
 from __future__ import annotations
@@ -32,47 +32,47 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-if "numpy" not in sys.modules:  # products this small take ten times as long on several threads
+if "numpy" not in sys.modules:  # products this small are ten times slower on several threads
     for _name in (*_ONE_THREAD, "VECLIB_MAXIMUM_THREADS"):
         os.environ.setdefault(_name, "1")
 
-import numpy as np  # noqa: E402  (after the number of threads)
+import numpy as np  # noqa: E402  (after setting the number of threads)
 
-SCHEMA = 1  # of the manifest; one more whenever this file would misread the next one
+SCHEMA = 1  # of the manifest; to be incremented when this file would misread a newer one
 TERMS = ("angular_velocity", "gravity", "command", "joint_position", "joint_velocity", "action")
 VARIANTS = ("full", "no_cross_attention", "no_grf", "no_highway", "blind")
 MOST_BYTES = {"manifest.json": 1 << 20, "cref_runtime.py": 1 << 20}
-MOST_BYTES_OF_ARRAYS = 1 << 28  # of another file
-TOLERANCE = 1e-5  # of the self-test: length of a tensor's error, of the tensor's own
-GRAVITY_LENGTH = (0.8, 1.25)  # of what must be a direction, and not m/s^2
+MOST_BYTES_OF_ARRAYS = 1 << 28  # of every other file
+TOLERANCE = 1e-5  # of the self-test: norm of a tensor's error relative to the tensor's norm
+GRAVITY_LENGTH = (0.8, 1.25)  # of a unit vector; rejects m/s^2
 _NPY = re.compile(
     rb"\x93NUMPY\x01\x00..\{'descr': '(?P<kind><f4|<f8|<i8|\|b1)', 'fortran_order': False, "
     rb"'shape': \((?P<shape>[0-9, ]{0,99})\), \}",
     re.DOTALL,
 )
-POSE_MARGIN = 0.5  # rad beyond its range where a joint cannot be: degrees, or another joint's angle
-LATE = 2.0  # control periods between two steps
+POSE_MARGIN = 0.5  # rad beyond a joint's range; more means degrees, or another joint's angle
+LATE = 2.0  # control periods between two steps, at most
 
 
 class PolicyFormatError(ValueError):
-    """What was to be loaded is not a policy of this format; the message is one line."""
+    """The files are not a policy of this format; the message is one line."""
 
 
 class Status(enum.IntFlag):
-    """What was wrong in a step or with a frame; 0 where nothing was."""
+    """Faults of a step or a frame; 0 means none."""
 
     OK = 0
     NO_DEPTH = 1  # no frame has come since the reset
     STALE_DEPTH = 2  # the newest frame is older than the manifest allows
-    BAD_DEPTH = 4  # the frame's shape, type or stamp is wrong: it was not used
-    INVALID_DEPTH = 8  # too many of the frame's pixels are holes: it was not used
-    BAD_INPUT = 16  # wrong shape, not finite, or impossible: the network was not asked
-    BAD_ACTION = 32  # the network's answer was not finite
-    COMMAND_LIMITED = 64  # the command was outside of what was trained
-    RATE_LIMITED = 128  # the target would have moved too far in one step
-    RANGE_LIMITED = 256  # the target would have been too far beyond a joint's range
-    LATE = 512  # the step before is too long ago, or the clock went back
-    HOLDING = 1024  # the last good target was given once more
+    BAD_DEPTH = 4  # the frame's shape, type or stamp is wrong: not used
+    INVALID_DEPTH = 8  # too many of the frame's pixels are holes: not used
+    BAD_INPUT = 16  # wrong shape, not finite, or impossible: the network was not run
+    BAD_ACTION = 32  # the network's output was not finite
+    COMMAND_LIMITED = 64  # the command was outside the trained range and was clipped
+    RATE_LIMITED = 128  # the change of the target in this step was limited
+    RANGE_LIMITED = 256  # the target was too far beyond a joint's range and was clipped
+    LATE = 512  # the previous step is too long ago, or the clock went back
+    HOLDING = 1024  # the last good target was returned again
     DAMPING = 2048  # the target is the measured pose, until `reset`
 
 
@@ -80,7 +80,7 @@ FAULTS = Status.BAD_INPUT | Status.BAD_ACTION
 
 
 class Joints(NamedTuple):
-    """The joints that the policy drives, in the order of every array; SI units."""
+    """The joints driven by the policy, in the order of every array; SI units."""
 
     names: tuple[str, ...]
     default: np.ndarray  # rad, q0
@@ -93,11 +93,11 @@ class Joints(NamedTuple):
 
 
 def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> Policy:
-    """Return the policy in a directory, or in the .zip of one.
+    """Load the policy in a directory, or in a .zip of one.
 
     Args:
-        path: what `python -m cref_jax.export` wrote.
-        joints: the names of the robot's joints in its own order, which must be the policy's.
+        path: output of `python -m cref_jax.export`.
+        joints: names of the robot's joints in its own order, which must equal the policy's.
 
     Raises:
         PolicyFormatError: a file is missing, damaged or of another format, or the joints differ.
@@ -106,31 +106,31 @@ def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> P
         policy = Policy(*contents(path))
     if joints is not None and tuple(joints) != policy.joints.names:
         ours, theirs = ", ".join(policy.joints.names), ", ".join(map(str, joints))
-        raise PolicyFormatError(f"{path}: its joints are {ours}, and the robot's {theirs}")
+        raise PolicyFormatError(f"{path}: its joints are {ours}, but the robot's are {theirs}")
     if not any(os.environ.get(name) == "1" for name in _ONE_THREAD):
         warnings.warn("steps are slow unless OMP_NUM_THREADS=1 is set first", stacklevel=2)
     return policy
 
 
 def contents(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return the manifest and the arrays of weights.npz, by name, as they were exported.
+    """Read the manifest and the arrays of weights.npz, by name, as exported.
 
     Raises:
         PolicyFormatError: a file is missing, damaged or of another format.
     """
     with _one_error(path):
-        manifest = _manifest(_read(path, "manifest.json"))
-        return manifest, _arrays(_verified(path, "weights.npz", manifest))
+        manifest = _read_manifest(_read(path, "manifest.json"))
+        return manifest, _parse_arrays(_read_verified(path, "weights.npz", manifest))
 
 
 class Policy:
-    """A recurrent policy between `reset` and the robot's last step. Buffers are made once."""
+    """A recurrent policy with its memory. Buffers are allocated once."""
 
     def __init__(self, manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-        """Check the manifest's numbers and take the arrays of weights.npz by name and shape."""
+        """Check the manifest's numbers and the names and shapes of the arrays of weights.npz."""
         root, weights = _Table(manifest, "manifest"), _Weights(dict(arrays))
         net, guards, obs = root.table("network"), root.table("guards"), root.table("observation")
-        self.joints = _joints(root)
+        self.joints = _read_joints(root)
         self.period = 1.0 / root.table("rates").real("control_hz", 1.0, 1000.0)  # s
         self.blind = net.text("variant", VARIANTS) == "blind"
         self.status = Status.OK
@@ -164,23 +164,23 @@ class Policy:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: call before the first step, and to walk again after damping."""
+        """Clear all memory: call before the first step, and to walk again after damping."""
         with self._lock:
             self._stamp: float | None = None
             self._actor.reset()
         self._previous = np.zeros(len(self.joints.names), np.float32)
-        self._before: float | None = None  # when the last step was, s
+        self._before: float | None = None  # time of the last step, s
         self._aimed = False  # a target has been given
         self._faults = self._hold_steps  # nothing to hold yet
         self._damping = False
         self.status = Status.OK
 
     def on_depth(self, depth: Any, stamp: Any) -> Status:
-        """Take a frame: z-depth [H, W] in metres, or uint16 in millimetres; row 0 is the top.
+        """Encode a frame: z-depth [H, W] in metres, or uint16 in millimetres; row 0 is the top.
 
-        `stamp` is when it was exposed, s, on the clock of `step`. What is further than d_max, even
-        infinitely, reads as d_max, as a miss did in training. Pixels that are 0 or NaN are holes,
-        filled in from around them.
+        `stamp` is its time of exposure, s, on the clock of `step`. Depths beyond d_max, including
+        infinity, are clipped to d_max, as misses were in training. Pixels that are 0 or NaN are
+        holes, filled in from their surroundings.
         """
         with np.errstate(all="ignore"):
             return self._see(depth, stamp)
@@ -194,12 +194,12 @@ class Policy:
         qd: Any,
         now: Any,
     ) -> np.ndarray:
-        """Return the joint targets for the next control period, rad [J]; `status` says the rest.
+        """Compute the joint targets for the next control period, rad [J]; sets `status`.
 
         Args:
             angular_velocity: of the base in its own frame, rad/s [3].
-            gravity: its direction in that frame, [3]; (0, 0, -1) where the robot is upright.
-            command: forward and leftward speed, m/s, and turning left, rad/s [3].
+            gravity: its direction in that frame, [3]; (0, 0, -1) when the robot is upright.
+            command: forward and leftward speed, m/s, and yaw rate to the left, rad/s [3].
             q: joint angles, rad [J].
             qd: joint speeds, rad/s [J].
             now: the time, s.
@@ -218,15 +218,15 @@ class Policy:
         return (self._q if self._damping else self._target).copy()
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """Return copies of what the network held after the last step, by name."""
+        """Copy the network's tensors after the last step, by name."""
         tensors = {**self._actor.tensors(), "previous_action": self._previous}
         return {name: np.array(tensor) for name, tensor in tensors.items()}
 
     def _see(self, depth: Any, stamp: Any) -> Status:
-        """Encode a frame, if it can be used."""
+        """Check a frame and encode it if usable."""
         try:
             frame, stamp = np.asarray(depth), float(stamp)
-        except Exception:  # whatever an object's own conversion raises
+        except Exception:  # an object's own conversion may raise anything
             return Status.BAD_DEPTH
         usable = frame.dtype.kind == "f" or frame.dtype == np.uint16
         if self.blind or frame.shape != self.image_shape or not usable or not np.isfinite(stamp):
@@ -240,17 +240,17 @@ class Policy:
         far = np.float32(self._d_max)
         share = np.where(valid, np.minimum(metres, far), far) / far
         if not valid.all():
-            # 1 / depth of a plane is linear in the image: level ground is filled in as it is
-            share = np.where(valid, share, 1.0 / _filled(1.0 / share, valid))
+            # 1 / depth of a plane is linear in the image, so level ground is filled in exactly
+            share = np.where(valid, share, 1.0 / _fill_holes(1.0 / share, valid))
         image = (_nearest_around(share, self._window) - 0.5).astype(np.float32)
-        encoded = self._encoder(image.astype(np.float16).astype(np.float32))  # as training had it
+        encoded = self._encoder(image.astype(np.float16).astype(np.float32))  # as in training
         with self._lock:
             self._actor.look(*encoded)
             self._stamp = stamp
         return Status.OK
 
     def _sense(self, inputs: Sequence[Any]) -> Status:
-        """Put what was measured into the observation, if it can be true."""
+        """Check the measurements and write them into the observation if plausible."""
         count, joints = len(self.joints.names), self.joints
         vectors = [_vector(x, size) for x, size in zip(inputs, (3, 3, 3, count, count))]
         angular_velocity, gravity, command, q, qd = vectors
@@ -269,13 +269,13 @@ class Policy:
             return Status.BAD_INPUT
         if not GRAVITY_LENGTH[0] < float(np.sqrt(gravity @ gravity)) < GRAVITY_LENGTH[1]:
             return Status.BAD_INPUT
-        asked = np.clip(command, *self._command)
-        parts = (angular_velocity, gravity, asked, q - joints.default, qd, self._previous)
+        limited = np.clip(command, *self._command)
+        parts = (angular_velocity, gravity, limited, q - joints.default, qd, self._previous)
         np.concatenate(parts, out=self._obs)
-        return Status.OK if (asked == command).all() else Status.COMMAND_LIMITED
+        return Status.OK if (limited == command).all() else Status.COMMAND_LIMITED
 
     def _time(self, now: Any) -> Status:
-        """Return what is wrong with the time of a step, and with the age of the frame at hand."""
+        """Check the time of a step and the age of the current frame."""
         status, before, stamp = Status.OK, self._before, self._stamp
         try:
             now = float(now)
@@ -293,7 +293,7 @@ class Policy:
         return status | (Status.STALE_DEPTH if abs(now - stamp) > self._stale else Status.OK)
 
     def _act(self) -> Status:
-        """Ask the network, and aim at what it says if that is a number."""
+        """Run the network and set the target if the action is finite."""
         self._obs -= self._mean
         self._obs /= self._std
         np.clip(self._obs, -self._clip, self._clip, out=self._obs)
@@ -305,7 +305,7 @@ class Policy:
         return self._aim()
 
     def _aim(self) -> Status:
-        """Turn the action into the target, within the limits."""
+        """Convert the action to the target, within the limits."""
         status, joints = Status.OK, self.joints
         wanted = joints.default + joints.scale * self._previous
         target = np.clip(wanted, joints.low - self._beyond, joints.high + self._beyond)
@@ -327,7 +327,7 @@ class _Encoder:
         tokenizer = weights.under("depth_tokenizer")
         rows, columns = shape
         self._layers, channels = [], 1
-        for i, settings in enumerate(_convolutions(net, shape)):
+        for i, settings in enumerate(_read_convolutions(net, shape)):
             weights_i = tokenizer.under(f"layer_{i}")
             self._layers.append(_Convolution(weights_i, (rows, columns, channels), *settings))
             rows, columns, channels = self._layers[-1].shape
@@ -340,7 +340,7 @@ class _Encoder:
         self._compression = _Dense(weights, "depth_compression/layer_0", blocks, out, elu=True)
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tokens [N, D] and the compressed depth [C] of D [H, W]."""
+        """Compute the tokens [N, D] and the compressed depth [C] of D [H, W]."""
         x = image[..., None]
         for layer in self._layers:
             x = layer(x)
@@ -351,7 +351,7 @@ class _Encoder:
 
 
 class _Actor:
-    """The recurrent part, at 50 Hz: the observation and the frame at hand to the action."""
+    """The recurrent part, at 50 Hz: from the observation and the current frame to the action."""
 
     def __init__(
         self, net: _Table, weights: _Weights, shape: tuple[int, int], size: int, actions: int
@@ -359,7 +359,7 @@ class _Actor:
         variant, width = net.text("variant", VARIANTS), net.whole("token", 1, 4096)
         self._sees = variant != "blind"
         compressed = net.whole("compressed", 1, 4096) if self._sees else 0
-        shrink = [stride for _, _, stride in _convolutions(net, shape)] if self._sees else []
+        shrink = [stride for _, _, stride in _read_convolutions(net, shape)] if self._sees else []
         tokens = int(np.prod(shape) // np.prod(shrink) ** 2) if self._sees else 0
         self._tokens = np.zeros((tokens, width), np.float32)
         self._query: _Attention | _Pooled | None = None
@@ -378,14 +378,14 @@ class _Actor:
         self._memory = _Memory(weights.under("recurrent_fusion"), fused, hidden, highway)
         head = net.wholes("actor", 1, 8192)
         self._head = _Mlp(weights.under("action_head"), (fused, *head, actions))
-        weights.take("log_std", actions)  # for those who train on
+        weights.take("log_std", actions)  # needed only to continue training
         self._inputs = np.zeros(size + compressed, np.float32)
         self._known = np.zeros(size + 3, np.float32)
         self._x = np.zeros(fused, np.float32)
         self._size, self._width, self._seen = size, width, False
 
     def reset(self) -> None:
-        """Empty the memories; until the next frame, what would be read off it is zero."""
+        """Clear the memories; everything derived from a frame is zero until the next one."""
         self._lstm.c[:], self._lstm.h[:], self._memory.h[:] = 0.0, 0.0, 0.0
         self._tokens[:], self._inputs[:], self._x[:] = 0.0, 0.0, 0.0
         if isinstance(self._query, _Attention):
@@ -393,12 +393,12 @@ class _Actor:
         self._seen = False
 
     def look(self, tokens: np.ndarray, compressed: np.ndarray) -> None:
-        """Hold what a frame has been encoded to."""
+        """Store the encoding of a frame."""
         self._tokens[:], self._inputs[self._size :] = tokens, compressed
         self._seen = True
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
-        """Return the action [J], and remember."""
+        """Compute the action [J] and update the memory."""
         self._inputs[: self._size], self._known[: self._size] = obs, obs
         self._known[self._size :] = self._lstm(self._inputs)
         state = self._tokenizer(self._known)
@@ -408,8 +408,8 @@ class _Actor:
         return self._head(self._memory(self._fusion(self._x)))
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """Return what was held after the last step, without copying it."""
-        found = {
+        """Return the tensors after the last step, without copying them."""
+        tensors = {
             "velocity": self._known[self._size :],
             "state_token": self._x[: self._width],
             "fused": self._fusion.out,
@@ -421,19 +421,19 @@ class _Actor:
             "action": self._head.out,
         }
         if self._query is not None:
-            found["tokens"], found["compressed"] = self._tokens, self._inputs[self._size :]
-            found["depth_token"] = self._x[self._width :]
+            tensors["tokens"], tensors["compressed"] = self._tokens, self._inputs[self._size :]
+            tensors["depth_token"] = self._x[self._width :]
             if isinstance(self._query, _Attention):
-                found["attention"] = self._query.weights
-        return found
+                tensors["attention"] = self._query.weights
+        return tensors
 
 
 class _Attention:
-    """What the robot's own state asks of the depth tokens (Eq. 8-10)."""
+    """Cross attention: the robot's state queries the depth tokens (Eq. 8-10)."""
 
     def __init__(self, weights: _Weights, width: int, heads: int, tokens: int) -> None:
         if width % heads:
-            raise PolicyFormatError(f"{heads} heads do not share a width of {width}")
+            raise PolicyFormatError(f"{heads} heads do not divide a width of {width}")
         each = width // heads
         self._norm = _Norm(weights, width)
         self._query = _Dense(weights, "query", width, width, bias=False)
@@ -445,10 +445,10 @@ class _Attention:
         self.weights = np.zeros((heads, tokens), np.float32)
 
     def __call__(self, state: np.ndarray, tokens: np.ndarray) -> np.ndarray:
-        """Return e^d [D] for the state [D] and the tokens [N, D]."""
+        """Compute e^d [D] from the state [D] and the tokens [N, D]."""
         query = self._query(self._norm(state)).reshape(self._shape)
-        asked = np.matmul(query, self._key)[:, 0]
-        weights = np.dot(asked, tokens.T, out=self.weights)
+        query_key = np.matmul(query, self._key)[:, 0]
+        weights = np.dot(query_key, tokens.T, out=self.weights)
         weights /= self._root
         weights -= weights.max(axis=1, keepdims=True)
         np.exp(weights, out=weights)
@@ -464,7 +464,7 @@ class _Pooled:
         self._projection = _Dense(weights, "projection", width, width)
 
     def __call__(self, state: np.ndarray, tokens: np.ndarray) -> np.ndarray:
-        """Return the projected mean [D], whatever the state is."""
+        """Compute the projected mean [D]; the state is not used."""
         return self._projection(tokens.mean(axis=0))
 
 
@@ -479,7 +479,7 @@ class _Lstm:
         self.c, self.h = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the velocity, m/s [3]."""
+        """Compute the velocity, m/s [3]."""
         gates, n = self._gates, len(self.c)
         np.dot(self.h, self._recurrent, out=gates)
         gates += self._input(x)
@@ -503,7 +503,7 @@ class _Fusion:
         self._gated, self.out = gated, np.zeros(width, np.float32)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return f [D] of x [D]."""
+        """Compute f [D] of x [D]."""
         content = self._content(self._mix(self._norm(x)))
         if self._gated:
             content, gate = content[: len(x)], content[len(x) :]
@@ -526,7 +526,7 @@ class _Memory:
         self.gate = np.ones(width, np.float32)
 
     def __call__(self, f: np.ndarray) -> np.ndarray:
-        """Return y [D] of f [D], and remember."""
+        """Compute y [D] of f [D] and update the memory."""
         n, x, gates = len(self.h), self._input(f), self._gates
         np.dot(self.h, self._recurrent, out=gates)
         gates[: 2 * n] += x[: 2 * n]
@@ -552,7 +552,7 @@ class _Memory:
 
 
 class _Convolution:
-    """A convolution as one product of gathered patches, then ELU; padding as in training."""
+    """A convolution as one matrix product of gathered patches, then ELU; padding as in training."""
 
     def __init__(
         self,
@@ -579,14 +579,14 @@ class _Convolution:
         self._filter = _Dense(weights, "filter", size, channels, count, elu=True)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the filtered image [h, w, channels] of [H, W, depth]."""
+        """Compute the filtered image [h, w, channels] of [H, W, depth]."""
         self._inside[:] = image
         self._patches.reshape(self._windows.shape)[:] = self._windows
         return self._filter(self._patches).reshape(self.shape)
 
 
 class _Mlp:
-    """Dense layers with ELU between them and none after the last."""
+    """Dense layers with ELU between them."""
 
     def __init__(self, weights: _Weights, widths: Sequence[int]) -> None:
         self._layers = [
@@ -596,14 +596,14 @@ class _Mlp:
         self.out = self._layers[-1].out
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the last layer's output."""
+        """Compute the last layer's output."""
         for layer in self._layers:
             x = layer(x)
         return x
 
 
 class _Dense:
-    """x W + b into a buffer that the next call overwrites, then ELU if asked for."""
+    """x W + b, then optionally ELU, in a buffer that the next call overwrites."""
 
     def __init__(
         self,
@@ -621,7 +621,7 @@ class _Dense:
         self._below = np.zeros_like(self.out) if elu else None
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the output of x [inputs] or [rows, inputs]."""
+        """Compute the output of x [inputs] or [rows, inputs]."""
         np.dot(x, self._kernel, out=self.out)
         if self._bias is not None:
             self.out += self._bias
@@ -641,7 +641,7 @@ class _Norm:
         self._bias = weights.take("norm/bias", width)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the normalised x."""
+        """Normalise x."""
         centred = x - x.mean(axis=-1, keepdims=True)
         variance = np.mean(centred * centred, axis=-1, keepdims=True)
         centred *= self._scale / np.sqrt(variance + np.float32(1e-6))
@@ -649,8 +649,8 @@ class _Norm:
         return centred
 
 
-def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return an image [H, W] with lines along rows, then columns, between the known pixels."""
+def _fill_holes(values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Interpolate an image [H, W] linearly between known pixels: along rows, then columns."""
     row, column, lines = np.arange(len(values)), np.arange(values.shape[1]), values.copy()
     some = np.flatnonzero(known.any(axis=1))
     for i in some:
@@ -659,7 +659,7 @@ def _filled(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _nearest_around(image: np.ndarray, window: int) -> np.ndarray:
-    """Return the least of the window x window values around each pixel, at the rims of fewer."""
+    """Compute the minimum of the window x window values around each pixel, fewer at the borders."""
     reach, (rows, columns) = window // 2, image.shape
     wide = np.pad(image, reach, constant_values=np.inf)
     lines = np.minimum.reduce([wide[k : k + rows] for k in range(window)])
@@ -667,10 +667,10 @@ def _nearest_around(image: np.ndarray, window: int) -> np.ndarray:
 
 
 def _vector(value: Any, size: int) -> np.ndarray | None:
-    """Return f32[size], or None where the value is not so many finite numbers."""
+    """Convert to f32[size]; None unless the value is `size` finite numbers."""
     try:
         array = np.asarray(value)
-    except Exception:  # whatever an object's own conversion raises
+    except Exception:  # an object's own conversion may raise anything
         return None
     if array.dtype.kind not in "fiu" or array.shape != (size,):
         return None
@@ -679,50 +679,50 @@ def _vector(value: Any, size: int) -> np.ndarray | None:
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
-    """Return 1 / (1 + exp(-x)) in the place of x."""
+    """Compute 1 / (1 + exp(-x)) in place."""
     np.negative(x, out=x)
-    np.minimum(x, 80.0, out=x)  # exp would overflow; the result is 0 to the last bit either way
+    np.minimum(x, 80.0, out=x)  # keeps exp from overflowing; the result is below 2e-35 either way
     np.exp(x, out=x)
     x += 1.0
     return np.reciprocal(x, out=x)
 
 
 def _copy(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
-    """Return x with its axes in another order, in memory as well."""
+    """Copy x with its axes permuted, contiguous in memory."""
     return np.ascontiguousarray(x.transpose(axes))
 
 
 class _Weights:
-    """The arrays of weights.npz, each to be taken once by its name and shape."""
+    """The arrays of weights.npz, each taken once by name and shape."""
 
     def __init__(self, arrays: dict[str, np.ndarray], prefix: str = "") -> None:
         self._left, self._prefix = arrays, prefix
 
     def under(self, name: str) -> _Weights:
-        """Return the arrays of one part of the network."""
+        """Select the arrays of one part of the network."""
         return _Weights(self._left, f"{self._prefix}{name}/")
 
     def take(self, name: str, *shape: int) -> np.ndarray:
-        """Return a copy of the array, aligned in memory."""
+        """Take a copy of an array, aligned in memory."""
         name = self._prefix + name
         if name not in self._left:
             raise PolicyFormatError(f"weights.npz has no '{name}'")
         array = self._left.pop(name)
         if array.dtype != np.dtype("<f4") or array.shape != shape:
-            found = f"{array.dtype}{list(array.shape)}"
-            raise PolicyFormatError(f"'{name}' must be float32{list(shape)}, not {found}")
+            actual = f"{array.dtype}{list(array.shape)}"
+            raise PolicyFormatError(f"'{name}' must be float32{list(shape)}, not {actual}")
         if not np.isfinite(array).all():
             raise PolicyFormatError(f"'{name}' has numbers that are not finite")
         return array.astype(np.float32)
 
     def finish(self) -> None:
-        """Refuse arrays that nothing has asked for."""
+        """Refuse arrays that were not taken."""
         if self._left:
             raise PolicyFormatError(f"weights.npz has an unknown '{min(self._left)}'")
 
 
 class _Table:
-    """An object of the manifest, read key by key; whatever is not as asked is an error."""
+    """An object of the manifest, read key by key; every unexpected value is an error."""
 
     def __init__(self, value: Any, where: str) -> None:
         if not isinstance(value, dict):
@@ -735,57 +735,57 @@ class _Table:
         return self._values[key]
 
     def _refuse(self, key: str, right: str) -> PolicyFormatError:
-        found = repr(self._values[key])[:60]
-        return PolicyFormatError(f"{self._where}.{key} must be {right}, not {found}")
+        actual = repr(self._values[key])[:60]
+        return PolicyFormatError(f"{self._where}.{key} must be {right}, not {actual}")
 
     def table(self, key: str) -> _Table:
-        """Return an object."""
+        """Read an object."""
         return _Table(self._get(key), f"{self._where}.{key}")
 
     def tables(self, key: str) -> list[_Table]:
-        """Return an array of objects."""
+        """Read an array of objects."""
         where = f"{self._where}.{key}"
         return [_Table(value, f"{where}[{i}]") for i, value in enumerate(self.array(key))]
 
     def array(self, key: str) -> list[Any]:
-        """Return an array of at most 1024 values."""
+        """Read an array of at most 1024 values."""
         values = self._get(key)
         if not isinstance(values, list) or len(values) > 1024:
             raise self._refuse(key, "an array")
         return values
 
     def text(self, key: str, among: Sequence[str] = ()) -> str:
-        """Return a text, one of `among` if given."""
+        """Read a non-empty string, one of `among` if given."""
         value = self._get(key)
         if not isinstance(value, str) or not value or (among and value not in among):
-            raise self._refuse(key, f"one of {', '.join(among)}" if among else "a text")
+            raise self._refuse(key, f"one of {', '.join(among)}" if among else "a string")
         return value
 
     def real(self, key: str, low: float, high: float) -> float:
-        """Return a number in [low, high]."""
+        """Read a number in [low, high]."""
         self._numbers(key, [self._get(key)], low, high)
         return float(self._values[key])
 
     def reals(self, key: str, count: int, low: float = -1e6) -> np.ndarray:
-        """Return f32[count] of numbers from `low` to 1e6."""
+        """Read `count` numbers from `low` to 1e6 as f32[count]."""
         values = self._numbers(key, self.array(key), low, 1e6)
         if len(values) != count:
             raise self._refuse(key, f"{count} numbers")
         return values
 
     def has(self, key: str) -> bool:
-        """Return whether there is such an entry: those of a later format may be missing."""
+        """Check whether the key exists: keys of later formats may be missing."""
         return key in self._values
 
     def whole(self, key: str, low: int, high: int) -> int:
-        """Return a whole number in [low, high]."""
+        """Read an integer in [low, high]."""
         value = self._get(key)
         if type(value) is not int or not low <= value <= high:
-            raise self._refuse(key, f"a whole number from {low} to {high}")
+            raise self._refuse(key, f"an integer from {low} to {high}")
         return value
 
     def wholes(self, key: str, low: int, high: int) -> tuple[int, ...]:
-        """Return whole numbers in [low, high]."""
+        """Read an array of integers in [low, high]."""
         values = {str(i): value for i, value in enumerate(self.array(key))}
         table = _Table(values, f"{self._where}.{key}")
         return tuple(table.whole(i, low, high) for i in values)
@@ -796,12 +796,12 @@ class _Table:
         return np.array(values, np.float32)
 
 
-def _joints(root: _Table) -> Joints:
-    """Return the joints of the manifest."""
+def _read_joints(root: _Table) -> Joints:
+    """Read the joints of the manifest."""
     tables = root.tables("joints")
     names = tuple(table.text("name") for table in tables)
     if not names or len(set(names)) < len(names):
-        raise PolicyFormatError("manifest.joints must be some joints of different names")
+        raise PolicyFormatError("manifest.joints must be one or more joints of different names")
     ranges = {
         "default_rad": (-10.0, 10.0),
         "action_scale_rad": (0.0, 10.0),
@@ -821,35 +821,35 @@ def _joints(root: _Table) -> Joints:
     return joints
 
 
-def _convolutions(net: _Table, shape: tuple[int, int]) -> list[tuple[int, ...]]:
-    """Return channels, kernel and stride of each layer of the depth tokenizer."""
+def _read_convolutions(net: _Table, shape: tuple[int, int]) -> list[tuple[int, ...]]:
+    """Read channels, kernel and stride of each layer of the depth tokenizer."""
     rows, columns = shape
-    found = []
+    layers = []
     for i, layer in enumerate(net.tables("convolutions")):
         settings = tuple(layer.whole(key, 1, 1024) for key in ("channels", "kernel", "stride"))
         if rows % settings[2] or columns % settings[2]:
             raise PolicyFormatError(f"layer {i} does not divide an image of {shape}")
         rows, columns = rows // settings[2], columns // settings[2]
-        found.append(settings)
+        layers.append(settings)
     if shape[0] % 8 or shape[1] % 8:
         raise PolicyFormatError(f"an image of {shape} has no blocks of 8 x 8")
-    return found
+    return layers
 
 
 @contextlib.contextmanager
 def _one_error(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn whatever is raised into a PolicyFormatError that names the path."""
+    """Convert any exception into a PolicyFormatError that names the path."""
     try:
         yield
     except PolicyFormatError as error:
-        named = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-        raise PolicyFormatError(named) from None
-    except Exception as error:  # json, zipfile and numpy raise a dozen kinds on damaged files
+        message = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        raise PolicyFormatError(message) from None
+    except Exception as error:  # json, zipfile and numpy raise many kinds on damaged files
         raise PolicyFormatError(f"{path}: {type(error).__name__}: {error}") from None
 
 
 def _read(path: str | os.PathLike[str], name: str) -> bytes:
-    """Return a file of the directory, or of the .zip."""
+    """Read a file of the directory, or of the .zip."""
     place, most = Path(path), MOST_BYTES.get(name, MOST_BYTES_OF_ARRAYS)
     if not place.exists():
         raise PolicyFormatError("no such directory or .zip")
@@ -861,7 +861,7 @@ def _read(path: str | os.PathLike[str], name: str) -> bytes:
     data = file.read_bytes()
     if place.is_dir():
         return data
-    files = _members(data, "the .zip")
+    files = _read_zip(data, "the .zip")
     if len(files.get(name, b"")) > most:
         raise PolicyFormatError(f"{name} is larger than {most} bytes")
     if name not in files:
@@ -869,8 +869,8 @@ def _read(path: str | os.PathLike[str], name: str) -> bytes:
     return files[name]
 
 
-def _members(data: bytes, where: str) -> dict[str, bytes]:
-    """Return what a .zip holds by name; only stored members, so nothing can grow."""
+def _read_zip(data: bytes, where: str) -> dict[str, bytes]:
+    """Read the files of a .zip by name; only stored (uncompressed) ones, so none can expand."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
         names = [member.filename for member in members]
@@ -880,12 +880,12 @@ def _members(data: bytes, where: str) -> dict[str, bytes]:
             if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
                 raise PolicyFormatError(f"{where} is compressed or encrypted")
         if sum(member.file_size for member in members) > len(data):
-            raise PolicyFormatError(f"{where} says that it is larger than it is")
+            raise PolicyFormatError(f"{where} is smaller than the sizes in its index")
         return {member.filename: archive.read(member) for member in members}
 
 
-def _manifest(data: bytes) -> dict[str, Any]:
-    """Return the manifest, read strictly and true to its own digest."""
+def _read_manifest(data: bytes) -> dict[str, Any]:
+    """Parse the manifest strictly and check its digest."""
 
     def constant(name: str) -> Any:
         raise PolicyFormatError(f"manifest.json has {name} for a number")
@@ -900,34 +900,34 @@ def _manifest(data: bytes) -> dict[str, Any]:
     if table.text("format") != "cref-policy":
         raise PolicyFormatError("manifest.json is not that of a policy")
     if table.whole("schema", 0, 1 << 30) != SCHEMA:
-        raise PolicyFormatError(f"schema {manifest['schema']}, and this program reads {SCHEMA}")
+        raise PolicyFormatError(f"schema {manifest['schema']}, but this program reads {SCHEMA}")
     if table.text("digest") != manifest_digest(manifest):
         raise PolicyFormatError("manifest.json is not what was exported: its digest differs")
     return manifest
 
 
 def manifest_digest(manifest: dict[str, Any]) -> str:
-    """Return the SHA-256 of everything in a manifest but its own digest."""
+    """Compute the SHA-256 of a manifest without its own digest."""
     rest = {key: value for key, value in manifest.items() if key != "digest"}
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _verified(path: str | os.PathLike[str], name: str, manifest: dict[str, Any]) -> bytes:
-    """Return a file whose digest is that in the manifest."""
+def _read_verified(path: str | os.PathLike[str], name: str, manifest: dict[str, Any]) -> bytes:
+    """Read a file and check its digest against the manifest."""
     data, digest = _read(path, name), _Table(manifest, "manifest").table("files").text(name)
     if hashlib.sha256(data).hexdigest() != digest:
         raise PolicyFormatError(f"{name} is not what was exported: its digest differs")
     return data
 
 
-def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz by name, without a copy; pickles and objects are refused."""
-    found = {}
-    for name, member in _members(data, "an .npz").items():
+def _parse_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """Parse the arrays of an .npz by name, without a copy; refuse pickles and objects."""
+    arrays = {}
+    for name, member in _read_zip(data, "an .npz").items():
         match = _NPY.match(member[:4096])
         if not match or not name.endswith(".npy"):
-            raise PolicyFormatError(f"'{name[:60]}' is no array of numbers")
+            raise PolicyFormatError(f"'{name[:60]}' is not an array of numbers")
         kind, text = match.group("kind").decode(), match.group("shape").decode()
         shape = tuple(int(n) for n in text.split(",") if n.strip())
         start = int.from_bytes(member[8:10], "little") + 10
@@ -939,21 +939,21 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
             or member[match.end() : start].strip()
             or len(member) - start != size
         ):
-            raise PolicyFormatError(f"'{name[:60]}' has not the size that it says")
-        found[name[:-4]] = np.frombuffer(member, kind, offset=start).reshape(shape)
-    return found
+            raise PolicyFormatError(f"'{name[:60]}' does not have the size in its header")
+        arrays[name[:-4]] = np.frombuffer(member, kind, offset=start).reshape(shape)
+    return arrays
 
 
 def self_test(path: str | os.PathLike[str], rounds: int = 20) -> dict[str, np.ndarray]:
-    """Return the seconds that steps took, with a frame and without, as replayed from training.
+    """Replay the test vectors; return the durations of steps, s, with and without a frame.
 
     Raises:
-        PolicyFormatError: it cannot be loaded, or does not say what the network said in training.
+        PolicyFormatError: it cannot be loaded, or its outputs differ from the training network's.
     """
-    policy, manifest = load(path), _manifest(_read(path, "manifest.json"))
+    policy, manifest = load(path), _read_manifest(_read(path, "manifest.json"))
     if "cref_runtime.py" in manifest["files"]:  # a policy within the package uses the package's own
-        _verified(path, "cref_runtime.py", manifest)
-    vectors = _arrays(_verified(path, "testvectors.npz", manifest))
+        _read_verified(path, "cref_runtime.py", manifest)
+    vectors = _parse_arrays(_read_verified(path, "testvectors.npz", manifest))
     errors: dict[str, float] = {}
     steps = [_replay(policy, vectors, errors) for _ in range(rounds)]
     name = max(errors, key=lambda n: errors[n])
@@ -961,11 +961,11 @@ def self_test(path: str | os.PathLike[str], rounds: int = 20) -> dict[str, np.nd
         raise PolicyFormatError(f"'{name}' differs from training's by {errors[name]:.1e}")
     seconds, frames = np.concatenate(steps).T
     times = {"a frame and a step": seconds[frames > 0], "a step": seconds[frames == 0]}
-    return {name: found for name, found in times.items() if len(found)}
+    return {name: durations for name, durations in times.items() if len(durations)}
 
 
 def _replay(policy: Policy, vectors: dict[str, np.ndarray], errors: dict[str, float]) -> np.ndarray:
-    """Return [T, 2]: seconds and frames of each step; `errors` gets each tensor's largest, of 1."""
+    """Replay once; return seconds and frames of each step [T, 2], update the largest `errors`."""
     inputs = [vectors[name] for name in (*TERMS[:3], "q", "qd", "now")]
     expected = {k[7:]: v for k, v in vectors.items() if k.startswith("expect/")}
     scales = {k: float(np.linalg.norm(v)) / len(v) ** 0.5 + 1e-9 for k, v in expected.items()}
@@ -974,29 +974,29 @@ def _replay(policy: Policy, vectors: dict[str, np.ndarray], errors: dict[str, fl
         if vectors["reset"][t]:
             policy.reset()
         frames = np.flatnonzero(vectors["frame_step"] == t)
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         for k in frames:
             policy.on_depth(vectors["frames"][k], vectors["stamps"][k])
         target = policy.step(*(x[t] for x in inputs))
-        steps[t] = time.perf_counter() - begun, len(frames)
+        steps[t] = time.perf_counter() - started_at, len(frames)
         if policy.status & (FAULTS | Status.HOLDING | Status.DAMPING):
             raise PolicyFormatError(f"step {t} of the test vectors: {policy.status!r}")
-        said = {**policy.tensors(), "target": target}
+        tensors = {**policy.tensors(), "target": target}
         for name in expected:
-            error = float(np.linalg.norm(said[name] - expected[name][t])) / scales[name]
+            error = float(np.linalg.norm(tensors[name] - expected[name][t])) / scales[name]
             errors[name] = max(errors.get(name, 0.0), error if np.isfinite(error) else np.inf)
     return steps
 
 
 def report(times: dict[str, np.ndarray]) -> list[str]:
-    """Return the latencies that `self_test` has measured, in lines for people."""
+    """Format the latencies measured by `self_test` as lines of text."""
     of = lambda seconds: 1e3 * np.percentile(seconds, (50, 99, 100))
     text = "{}: p50 {:.2f} ms, p99 {:.2f} ms, max {:.2f} ms"
     return [text.format(name, *of(seconds)) for name, seconds in times.items()]
 
 
 def main() -> None:
-    """Run the command line; exit code 2 where the policy is not what it should be."""
+    """Run the self-test from the command line; exit code 2 if it fails."""
     parser = argparse.ArgumentParser(description="Test an exported policy on this machine.")
     parser.add_argument("--selftest", metavar="DIRECTORY", required=True, help="or its .zip")
     path = parser.parse_args().selftest
@@ -1005,7 +1005,7 @@ def main() -> None:
     except PolicyFormatError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    print(f"{path} says what it said in training, to {TOLERANCE:g}")
+    print(f"{path}: outputs match the training network to {TOLERANCE:g}")
     version = f"Python {sys.version.split()[0]}, numpy {np.__version__}"
     print("\n".join([version, *report(times)]))
 

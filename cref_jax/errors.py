@@ -1,17 +1,17 @@
-"""Errors that a user can mend: the message is one line that says what would be right."""
+"""Errors that a user can fix; each message is one line."""
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint that cannot be written or read; the message is one line that says which."""
+    """A checkpoint cannot be written or read; the message is one line that names it."""
 
 
 class DamagedCheckpoint(CheckpointError):
-    """The files of this step are not what was written; an older step may still be good."""
+    """The files of this step differ from those written; an older step may still be good."""
 
 
 class TrainingError(RuntimeError):
-    """Training cannot go on; the message is one line that says why."""
+    """Training cannot continue; the message is one line with the reason."""
 
 
 class ConfigError(ValueError):
-    """A setting that cannot be used; the message is one line that says what would be right."""
+    """A setting cannot be used; the message is one line that states what is expected."""

@@ -85,7 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
     with cli.one_line_errors(options.debug):
         jax_setup.prepare([options.engine])
-        subjects = [_subject(path, options) for path in _sources(options)]
+        subjects = [_subject(path, options) for path in _resolve_sources(options)]
         source = subjects[0].source
         out = options.out or (source if sources.is_run(source) else Path())
         if options.film:
@@ -97,13 +97,13 @@ def main(arguments: list[str] | None = None) -> None:
             "commands": _commands,
         }  # fmt: skip
         found = suites[options.suite](subjects, options)
-        record = {"suite": options.suite, "seed": options.seed, **_origin(subjects)}
+        record = {"suite": options.suite, "seed": options.seed, **_provenance(subjects)}
         record |= {"seconds": round(time.monotonic() - started, 1), **found}
         _write(out, record)
 
 
-def _sources(options: Options) -> list[Path]:
-    """Return the runs and policies to judge.
+def _resolve_sources(options: Options) -> list[Path]:
+    """Resolve the runs and policies to evaluate.
 
     Raises:
         ConfigError: an option that cannot be used.
@@ -128,36 +128,36 @@ def _subject(source: Path, options: Options) -> Subject:
     return Subject(source, sources.load(source, world), world)
 
 
-def _count(options: Options) -> int:
-    """Return the number of trials."""
+def _trials_per_cell(options: Options) -> int:
+    """Return the number of trials per cell."""
     return options.num_envs or (100 if jax.default_backend() == "cpu" else paper_results.TRIALS)
 
 
 def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    """Judge in all cells of Table II."""
-    console, count = Console(), _count(options)
+    """Evaluate in all cells of Table II."""
+    console, count = Console(), _trials_per_cell(options)
     console.print(f"{tables.interval_note(count * len(subjects))}\n{tables.RULE}", highlight=False)
     judged = []
     with _progress(console, 12 * count * len(subjects)) as ended:
         for subject in subjects:
-            w = tables.world(subject.policy.config, subject.world.physics)
+            w = tables.cell_world(subject.policy.config, subject.world.physics)
             judged.append(tables.run_cells(w, subject.policy.train, count, options.seed, ended))
-    rows = tables.cells(judged)
+    rows = tables.cell_rows(judged)
     whole = tables.overall(rows)
-    console.print(tables.text(rows, whole))
+    console.print(tables.to_table(rows, whole))
     console.print("* beyond chance: 0 is not in the 95 % interval of the difference")
-    console.print(tables.failures(rows), highlight=False)
+    console.print(tables.failure_lines(rows), highlight=False)
     return {"rule": tables.RULE, "cells": rows, "overall": whole}
 
 
 def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    """Judge with everything randomised, and with each part alone."""
-    console, count, policy = Console(), _count(options), subjects[0].policy
-    w = robustness_suite.world(policy.config, subjects[0].world.physics)
-    with _progress(console, len(robustness_suite.rows()) * count) as ended:
+    """Evaluate with everything randomised, and with each part alone."""
+    console, count, policy = Console(), _trials_per_cell(options), subjects[0].policy
+    w = robustness_suite.row_world(policy.config, subjects[0].world.physics)
+    with _progress(console, len(robustness_suite.list_rows()) * count) as ended:
         found = robustness_suite.run_rows(w, policy.train, count, options.seed, ended)
-    console.print(robustness_suite.text(found))
-    console.print(robustness_suite.alone(found))
+    console.print(robustness_suite.to_table(found))
+    console.print(robustness_suite.parts_table(found))
     whole = [row for row in found if row["part"] == robustness_suite.EVERYTHING]
     parts = [row for row in found if row["part"] != robustness_suite.EVERYTHING]
     overall = robustness_suite.overall(found)
@@ -165,23 +165,23 @@ def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
 
 
 def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    """Judge in the scenes, through the numpy runtime."""
-    with _exported(subjects[0]) as path:
+    """Evaluate in the scenes, through the numpy runtime."""
+    with _export_subject(subjects[0]) as path:
         verdict = scene_suite.run_scenes(path, options.num_envs or 10, options.stress, options.seed)
-    scene_results.show(verdict, Console())
+    scene_results.print_tables(verdict, Console())
     return verdict.as_dict()
 
 
 def _film(subject: Subject, options: Options, out: Path) -> None:
     """Film the first trial in a scene."""
-    with _exported(subject) as path:
-        trial = scene_suite.film(path, options.film or "", out, options.seed)
+    with _export_subject(subject) as path:
+        trial = scene_suite.film_trial(path, options.film or "", out, options.seed)
     print(f"wrote {out}: {trial.ending} after {trial.seconds:.1f} s and {trial.progress:.1f} m")
 
 
 @contextlib.contextmanager
-def _exported(subject: Subject) -> Iterator[Path]:
-    """Yield the policy as an exported one; a run's is written for the time being."""
+def _export_subject(subject: Subject) -> Iterator[Path]:
+    """Yield the policy as an exported one; a run's is exported to a temporary folder."""
     if not sources.is_run(subject.source):
         yield subject.source
         return
@@ -192,7 +192,7 @@ def _exported(subject: Subject) -> Iterator[Path]:
 
 
 def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    subject, count = subjects[0], _count(options)
+    subject, count = subjects[0], _trials_per_cell(options)
     with _progress(Console(), count) as ended:
         result = crossing.cross(
             subject.policy.config, subject.world.physics, subject.policy.train, options.kind,
@@ -204,34 +204,33 @@ def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
 
 def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
     subject = subjects[0]
-    result = walking.walk(
-        subject.policy.config, subject.world.physics, subject.policy.train, _count(options),
-        options.seed,
-    )  # fmt: skip
+    policy, count = subject.policy, _trials_per_cell(options)
+    physics = subject.world.physics
+    result = walking.walk(policy.config, physics, policy.train, count, options.seed)
     print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
     return result._asdict()
 
 
 def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    """Judge how commands are obeyed on level ground."""
+    """Evaluate how commands are followed on level ground."""
     policy, console = subjects[0].policy, Console()
     with console.status("13 commands, 10 s each"):
         physics = subjects[0].world.physics
         found = command_suite.run_commands(
-            policy.config, physics, policy.train, _count(options), options.seed
+            policy.config, physics, policy.train, _trials_per_cell(options), options.seed
         )
-    console.print(command_suite.text(found))
-    console.print(command_suite.lines(found), highlight=False)
+    console.print(command_suite.to_table(found))
+    console.print(command_suite.describe(found), highlight=False)
     return found
 
 
-def _origin(subjects: list[Subject]) -> dict[str, Any]:
-    """Return what was judged, by what and on what."""
+def _provenance(subjects: list[Subject]) -> dict[str, Any]:
+    """Collect policy, versions and machine for the record."""
     policies = [
         {
             "name": subject.policy.run.name,
             "source": subject.source.name if subject.source.is_absolute() else str(subject.source),
-            "digest": reader.digest(subject.policy),
+            "digest": reader.policy_digest(subject.policy),
             "iteration": subject.policy.iteration,
             "samples": subject.policy.samples,
         }
@@ -246,7 +245,7 @@ def _origin(subjects: list[Subject]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
-    """Yield what is told of the trials that have come to an end, and shows how many are left."""
+    """Yield a callback that advances the progress bar."""
     bar = Progress(
         TextColumn("trials"), MofNCompleteColumn(), BarColumn(), TextColumn("left"),
         TimeRemainingColumn(), console=console, transient=True,
@@ -270,7 +269,7 @@ def _progress(console: Console, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _write(out: Path, record: dict[str, Any]) -> None:
-    """Write eval.json, and the same as a page for people.
+    """Write eval.json and its page.
 
     What is there of another suite stays, under that suite's name.
     """
@@ -289,7 +288,7 @@ def _write(out: Path, record: dict[str, Any]) -> None:
 
 
 def _suite(path: Path) -> str | None:
-    """Return the suite of an evaluation that has been written, None if there is none."""
+    """Return the suite of an existing eval.json, or None."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         return json.loads(path.read_text())["suite"]
     return None

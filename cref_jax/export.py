@@ -36,7 +36,8 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare()
         if options.learner:
             _write_learner(
-                options.run or run_dir.newest(), cli.writable(options.learner, ".npz", "--learner")
+                options.run or run_dir.newest(),
+                cli.prepare_output(options.learner, ".npz", "--learner"),
             )
             return
         if options.policy:
@@ -61,7 +62,7 @@ def _export(options: Options) -> None:
 
 
 def _write_learner(run: Path, out: Path) -> None:
-    """Write what the run has learned."""
+    """Write actor, critic and optimizer of the run."""
     world = build_world(run_dir.read_config(run), "mujoco")
     learner_file.write(trained.load_policy(run, world), out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; python -m cref_jax.train --init {out}")

@@ -1,4 +1,4 @@
-"""Ground as MuJoCo geoms: columns of equal height merged into boxes, and its materials."""
+"""Terrain as MuJoCo geoms: columns of equal height merged into boxes, and its materials."""
 
 from typing import NamedTuple
 
@@ -6,14 +6,14 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-GROUND = 0  # geom group of the lane and of the plain; the robot's shapes are in 2 and 3
-MOST_BOXES = 150  # beyond, a height field; stairs take some 40, a slope 200 and more
-TILE = 1.0  # m, between two changes of tone
+GROUND = 0  # geom group of the lane and the plain; the robot's geoms are in 2 and 3
+MOST_BOXES = 150  # above this, a height field; stairs need about 40, a slope 200 or more
+TILE = 1.0  # m, length of a tile of one tone
 TONES = ((0.80, 0.78, 0.74), (0.66, 0.65, 0.63))  # red, green, blue
 
 
 class Boxes(NamedTuple):
-    """Rectangles of columns of one height and tone, B of them."""
+    """B rectangles of columns, each of one height and tone."""
 
     first: Int[np.ndarray, "B 2"]  # column
     size: Int[np.ndarray, "B 2"]  # columns
@@ -24,7 +24,7 @@ class Boxes(NamedTuple):
 def add_checker(
     spec: mujoco.MjSpec, name: str, tones: tuple[tuple[float, ...], ...], repeat: float
 ) -> None:
-    """Add a material with two fields of each tone a period, `repeat` periods a metre."""
+    """Add a checker material: two fields of each tone per period, `repeat` periods per metre."""
     spec.add_texture(
         name=name,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -39,36 +39,38 @@ def add_checker(
     spec.add_material(name=name, textures=textures, texuniform=True, texrepeat=[repeat, repeat])
 
 
-def boxes(heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES) -> Boxes | None:
-    """Return boxes that cover every column once, or None if more than `most` would be needed.
+def merge_boxes(
+    heights: Float[np.ndarray, "X Y"], tile: int, most: int = MOST_BOXES
+) -> Boxes | None:
+    """Cover every column by exactly one box; None if that takes more than `most` boxes.
 
-    Greedy: from the first column that is left, as far as possible across, then along.
+    Greedy: from the first uncovered column, as far as possible across (y), then along (x).
     """
-    tone = _tones(heights, tile)
+    tone = _column_tones(heights, tile)
     number = np.unique(heights, return_inverse=True)[1].reshape(heights.shape)
-    look = 2 * number + tone  # what a box has in common; -1: in a box already
-    found: list[tuple[tuple[int, int], tuple[int, int]]] = []
+    look = 2 * number + tone  # equal within a box; -1: already covered
+    rectangles: list[tuple[tuple[int, int], tuple[int, int]]] = []
     while (look >= 0).any():
-        if len(found) == most:
+        if len(rectangles) == most:
             return None
         i, j = (int(k) for k in np.unravel_index(np.argmax(look >= 0), look.shape))
-        across = _run(look[i, j:] == look[i, j])
-        along = _run((look[i:, j : j + across] == look[i, j]).all(axis=1))
+        across = _run_length(look[i, j:] == look[i, j])
+        along = _run_length((look[i:, j : j + across] == look[i, j]).all(axis=1))
         look[i : i + along, j : j + across] = -1
-        found.append(((i, j), (along, across)))
-    first, size = (np.array(part, np.int32) for part in zip(*found, strict=True))
+        rectangles.append(((i, j), (along, across)))
+    first, size = (np.array(part, np.int32) for part in zip(*rectangles, strict=True))
     at = tuple(first.T)
     return Boxes(first, size, heights[at], tone[at])
 
 
-def _tones(heights: Float[np.ndarray, "X Y"], tile: int) -> Int[np.ndarray, "X Y"]:
-    """Return 0 or 1 for each column: along x they take turns at each riser and each `tile`."""
+def _column_tones(heights: Float[np.ndarray, "X Y"], tile: int) -> Int[np.ndarray, "X Y"]:
+    """Compute the tone of each column, 0 or 1, changing along x at every riser and every `tile`."""
     x = np.arange(heights.shape[0])[:, None]
     risers = np.diff(heights, axis=0, prepend=heights[:1]) != 0.0
     since = x - np.maximum.accumulate(np.where(risers, x, 0), axis=0)  # the last riser
     return np.cumsum(risers | ((since > 0) & (since % tile == 0)), axis=0) % 2
 
 
-def _run(flags: Bool[np.ndarray, " n"]) -> int:
-    """Return how many flags are true before the first that is not."""
+def _run_length(flags: Bool[np.ndarray, " n"]) -> int:
+    """Count the flags that are true before the first false one."""
     return len(flags) if flags.all() else int(np.argmin(flags))

@@ -1,10 +1,10 @@
-"""The training program for an NVIDIA GPU, compiled on a machine that has none.
+"""The training program for an NVIDIA GPU, compiled on a machine without one.
 
     python -m cref_jax.gpu_program --gpu h100
 
-XLA compiles for a GPU from a description of the card. Nothing is executed and no array of a robot
-is made: world and state are shapes. It needs the packages of the CUDA plugin, and no driver. What
-is estimated is a bound by the card's bandwidth, its products and the launches, not a measurement.
+XLA compiles for a GPU from a description of the card. Nothing is executed and no arrays are
+allocated: world and state are shapes. This needs the packages of the CUDA plugin but no driver. The
+estimate is a bound from the card's bandwidth, its FLOP rate and the launches, not a measurement.
 """
 
 import collections
@@ -35,12 +35,12 @@ from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.training import iteration
 
-LAUNCH = 3e-6  # s; assumed: the least time of a kernel, its launch included
-BANDWIDTH_SHARE = 0.8  # assumed: what a kernel gets of the card's bandwidth
-PRODUCT_SHARE = 0.25  # assumed: what a product gets of the card's TF32 rate
-MARCH_TURNS = 80  # assumed: blocks that the longest ray of a frame crosses
+LAUNCH = 3e-6  # s; assumed: least time per kernel, including its launch
+BANDWIDTH_SHARE = 0.8  # assumed: achieved share of the card's bandwidth
+PRODUCT_SHARE = 0.25  # assumed: achieved share of the card's TF32 rate
+MARCH_TURNS = 80  # assumed: blocks crossed by the longest ray of a frame
 
-STAGES = (  # stage, then a file and, if it has to be, a function of the stack; the first that fits
+STAGES = (  # stage, file and, unless empty, function in the stack; the first match counts
     ("physics: MJX, line search", "mjx/_src/solver.py", "_linesearch"),
     ("physics: MJX, Newton", "mjx/_src/solver.py", ""),
     ("physics: MJX, before the solver", "cref_jax/physics/mjx_engine.py", ""),
@@ -56,15 +56,15 @@ REST = "rest"
 
 
 class Card(NamedTuple):
-    """An NVIDIA GPU, as XLA wants it described; from its data sheet."""
+    """An NVIDIA GPU as XLA describes it; values from its data sheet."""
 
     name: str
     capability: tuple[int, int]
     multiprocessors: int
-    threads: int  # of a multiprocessor
-    shared: int  # bytes of shared memory of a multiprocessor
-    shared_block: int  # bytes of it that one block can have
-    cache: int  # bytes of the second level
+    threads: int  # per multiprocessor
+    shared: int  # bytes of shared memory per multiprocessor
+    shared_block: int  # bytes of shared memory per block, at most
+    cache: int  # bytes of L2
     clock: float  # GHz
     memory: int  # bytes
     bandwidth: float  # bytes/s
@@ -90,18 +90,18 @@ CARDS = {
 
 @dataclass(frozen=True)
 class Options(cli.DebugOption):
-    """Compile the training program for a GPU, without one, and estimate its time."""
+    """Compile the training program for a GPU without having one, and estimate its time."""
 
     gpu: Literal["h100", "a100", "4090"] = "h100"
-    """the card"""
+    """GPU to compile for"""
     terrain: str = "mixed"
-    """what the robots stand on"""
+    """terrain name"""
     num_envs: int | None = None
-    """robots at once; as in `make train` on a GPU when left out"""
+    """parallel robots (default: as in `make train` on a GPU)"""
 
 
 class Stage(NamedTuple):
-    """What a part of an iteration takes."""
+    """Launches, work and time of a part of an iteration."""
 
     launches: float
     bytes: float
@@ -120,14 +120,14 @@ def main() -> None:
         card = CARDS[options.gpu]
         prepare()
         mesh = mesh_of(card)
-        with Console().status(f"compiling for {card.name} (five minutes of one core)"):
-            compiled = traced(c, "mjx", mesh).lower().compile()
-        stages = estimate(hlo.Program(compiled.as_text()), c, card)
+        with Console().status(f"compiling for {card.name} (five minutes on one core)"):
+            compiled = trace_iteration(c, "mjx", mesh).lower().compile()
+        stages = estimate_stages(hlo.Program(compiled.as_text()), c, card)
         show(c, card, compiled, stages)
 
 
 def prepare() -> None:
-    """Set JAX up for a plugin without a device.
+    """Configure JAX for a plugin without a device.
 
     Raises:
         ConfigError: the plugin is not installed.
@@ -135,20 +135,20 @@ def prepare() -> None:
     if not any(importlib.util.find_spec(f"jax_cuda{n}_plugin") for n in (12, 13)):
         raise ConfigError("compiling for a GPU needs JAX's plugin: pip install 'cref-jax[cuda12]'")
     os.environ.setdefault("XLA_FLAGS", "--xla_gpu_force_compilation_parallelism=1")  # memory
-    jax.config.update("jax_platforms", "cpu")  # the plugin looks for no device, and still compiles
-    jax.config.update("jax_traceback_in_locations_limit", -1)  # stages are told by whole stacks
+    jax.config.update("jax_platforms", "cpu")  # the plugin compiles without a device
+    jax.config.update("jax_traceback_in_locations_limit", -1)  # stages are found by full stacks
 
 
 def mesh_of(card: Card) -> Mesh:
-    """Return one device that is a description of this card."""
-    found = topologies.get_topology_desc(
-        card.name, "cuda", target_config=_description(card), topology="1x1x1"
+    """Build a mesh of one device described by `card`."""
+    topology = topologies.get_topology_desc(
+        card.name, "cuda", target_config=_target_config(card), topology="1x1x1"
     )
-    return Mesh(np.array(found.devices), (iteration.AXIS,), axis_types=(AxisType.Auto,))
+    return Mesh(np.array(topology.devices), (iteration.AXIS,), axis_types=(AxisType.Auto,))
 
 
-def _description(card: Card) -> str:
-    """Return the card as a text of XLA's GpuTargetConfigProto."""
+def _target_config(card: Card) -> str:
+    """Format the card as the text of XLA's GpuTargetConfigProto."""
     major, minor = card.capability
     return f"""
     gpu_device_info {{
@@ -178,41 +178,39 @@ def _description(card: Card) -> str:
     """
 
 
-def traced(c: Config, engine: Backend, mesh: Mesh) -> jax.stages.Traced:
-    """Return one iteration of training, traced from shapes on the devices of a mesh."""
-    world = world_of_shapes(c, engine, NamedSharding(mesh, P()))
-    return iteration.chunk.trace(world, iteration.shapes(world, mesh), mesh, 1)
+def trace_iteration(c: Config, engine: Backend, mesh: Mesh) -> jax.stages.Traced:
+    """Trace one training iteration from shapes on the devices of a mesh."""
+    world = abstract_world(c, engine, NamedSharding(mesh, P()))
+    return iteration.chunk.trace(world, iteration.state_shapes(world, mesh), mesh, 1)
 
 
-def world_of_shapes(c: Config, engine: Backend, place: NamedSharding) -> World:
-    """Return the world with shapes for arrays; to settle robots would compile their physics.
+def abstract_world(c: Config, engine: Backend, place: NamedSharding) -> World:
+    """Build the world with shapes for arrays, since settling robots would compile their physics.
 
     Raises:
-        ConfigError: the terrain cannot be used, or the engine is not installed.
+        ConfigError: the terrain is invalid, or the engine is not installed.
     """
     shape = lambda *sizes: jax.ShapeDtypeStruct(sizes, jnp.float32, sharding=place)
     physics, count = Physics(c.robot, c.physics, engine), c.episode.bank_size
     positions, velocities = physics.model.nq, physics.model.nv
     bank = Body(shape(count, positions), shape(count, velocities), shape(count, velocities))
-    return World(c, physics, _shapes(lanes.build(c.terrain), place), bank)
+    return World(c, physics, _abstract_arrays(lanes.build(c.terrain), place), bank)
 
 
-def _shapes(arrays: PyTree, place: NamedSharding) -> PyTree:
-    """Return the shapes of arrays, on these devices."""
+def _abstract_arrays(arrays: PyTree, place: NamedSharding) -> PyTree:
+    """Replace arrays by their shapes and dtypes on these devices."""
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x), sharding=place), arrays
     )
 
 
-def estimate(program: hlo.Program, c: Config, card: Card) -> dict[str, Stage]:
-    """Return what each stage of an iteration takes, the longest first."""
-    frames = depth.most_frames(c.ppo.horizon, c.camera, c.physics.control_period)
+def estimate_stages(program: hlo.Program, c: Config, card: Card) -> dict[str, Stage]:
+    """Estimate the launches, work and time of each stage of an iteration, longest first."""
+    frames = depth.max_frames(c.ppo.horizon, c.camera, c.physics.control_period)
 
-    def turns(stack: tuple[hlo.Frame, ...]) -> float:
+    def trip_count(stack: tuple[hlo.Frame, ...]) -> float:
         if _is_at(stack, "mjx/_src/solver.py", ""):
-            return float(
-                c.physics.iterations
-            )  # the robot that takes longest takes as many as it may
+            return float(c.physics.iterations)  # the slowest robot needs the maximum
         if _is_at(stack, "cref_jax/depth/raymarch.py", ""):
             return float(MARCH_TURNS)
         return (
@@ -221,19 +219,21 @@ def estimate(program: hlo.Program, c: Config, card: Card) -> dict[str, Stage]:
             else 1.0
         )
 
-    found = collections.defaultdict(lambda: Stage(0.0, 0.0, 0.0, 0.0))
-    for kernel in program.kernels(turns):
+    stages = collections.defaultdict(lambda: Stage(0.0, 0.0, 0.0, 0.0))
+    for kernel in program.kernels(trip_count):
         name = stage_of(kernel.stack)
-        name = stage_of(kernel.loop) if name == REST else name  # a copy of what the loop carries
+        name = stage_of(kernel.loop) if name == REST else name  # a copy of the loop carry
         moved = kernel.bytes / (BANDWIDTH_SHARE * card.bandwidth)
         seconds = max(LAUNCH, moved, kernel.flops / (PRODUCT_SHARE * card.products))
         one = Stage(1.0, kernel.bytes, kernel.flops, seconds)
-        found[name] = Stage(*(a + kernel.times * b for a, b in zip(found[name], one, strict=True)))
-    return dict(sorted(found.items(), key=lambda item: -item[1].seconds))
+        stages[name] = Stage(
+            *(a + kernel.times * b for a, b in zip(stages[name], one, strict=True))
+        )
+    return dict(sorted(stages.items(), key=lambda item: -item[1].seconds))
 
 
 def stage_of(stack: tuple[hlo.Frame, ...]) -> str:
-    """Return the stage that a line of the program belongs to, by the functions around it."""
+    """Return the stage of a source stack by its files and functions; `REST` without a match."""
     return next((name for name, *place in STAGES if _is_at(stack, *place)), REST)
 
 
@@ -244,21 +244,21 @@ def _is_at(stack: tuple[hlo.Frame, ...], file: str, function: str) -> bool:
 
 
 def show(c: Config, card: Card, compiled: jax.stages.Compiled, stages: dict[str, Stage]) -> None:
-    """Print the memory and the stages of an iteration."""
+    """Print the stages and the memory of an iteration."""
     samples = c.run.num_envs * c.ppo.horizon
     table = Table(title=f"{c.terrain.name}, {c.run.num_envs} robots x {c.ppo.horizon}, {card.name}")
     for column in ("stage", "launches", "GB", "Tflop", "ms, estimated"):
         table.add_column(column, justify="left" if column == "stage" else "right")
     total = Stage(*(sum(column) for column in zip(*stages.values(), strict=True)))
-    for name, s in [*stages.items(), ("an iteration", total)]:
+    for name, s in [*stages.items(), ("iteration", total)]:
         work = f"{s.launches:,.0f}", f"{s.bytes / 1e9:,.1f}", f"{s.flops / 1e12:,.2f}"
         table.add_row(name, *work, f"{1e3 * s.seconds:,.1f}")
     console = Console()
     console.print(table)
     if memory := compiled.memory_analysis():
         gib = memory.argument_size_in_bytes / 2**30, memory.temp_size_in_bytes / 2**30
-        console.print(f"memory: {gib[0]:.2f} GiB of state, {gib[1]:.2f} GiB besides")
-    console.print(f"estimated, nothing was run: {samples / total.seconds:,.0f} samples/s at most")
+        console.print(f"memory: {gib[0]:.2f} GiB of state, {gib[1]:.2f} GiB temporary")
+    console.print(f"estimate, nothing was run: {samples / total.seconds:,.0f} samples/s at most")
 
 
 if __name__ == "__main__":

@@ -16,18 +16,20 @@ from cref_jax.training import iteration
 
 @dataclass(frozen=True)
 class Options(cli.DebugOption):
-    """Count the parameters of each variant, by part."""
+    """Count the parameters of each variant by module."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.params")
     with cli.one_line_errors(options.debug):
-        Console().print(table({name: count(name) for name in typing.get_args(config.Variant)}))
+        Console().print(
+            build_table({name: count_parameters(name) for name in typing.get_args(config.Variant)})
+        )
 
 
-def count(variant: config.Variant) -> dict[str, int]:
-    """Return the number of parameters of each part of the actor, and of the critic."""
+def count_parameters(variant: config.Variant) -> dict[str, int]:
+    """Count the parameters of each module of the actor, and of the critic."""
     c = config.override(Config(), {"network": {"variant": variant}, "run": {"num_envs": 4}})
     params = jax.eval_shape(iteration.initial_state, build_world(c)).train.params
     size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))
@@ -35,20 +37,20 @@ def count(variant: config.Variant) -> dict[str, int]:
     return {**parts, "critic": size(params.critic)}
 
 
-def table(counts: dict[str, dict[str, int]]) -> Table:
-    """Return the counts, a column for each variant."""
-    found = Table(title="parameters")
-    found.add_column("part")
+def build_table(counts: dict[str, dict[str, int]]) -> Table:
+    """Build the table of counts with a column per variant."""
+    result = Table(title="parameters")
+    result.add_column("part")
     for variant in counts:
-        found.add_column(variant, justify="right")
+        result.add_column(variant, justify="right")
     parts = sorted({part for parts in counts.values() for part in parts} - {"critic"})
     for part in parts:
-        found.add_row(part, *(f"{c[part]:,}" if part in c else "-" for c in counts.values()))
-    found.add_section()
+        result.add_row(part, *(f"{c[part]:,}" if part in c else "-" for c in counts.values()))
+    result.add_section()
     policy = {v: sum(c.values()) - c["critic"] for v, c in counts.items()}
-    found.add_row("policy", *(f"{total:,}" for total in policy.values()))
-    found.add_row("critic", *(f"{c['critic']:,}" for c in counts.values()))
-    return found
+    result.add_row("policy", *(f"{total:,}" for total in policy.values()))
+    result.add_row("critic", *(f"{c['critic']:,}" for c in counts.values()))
+    return result
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ ENDINGS = {  # of an episode, by its name in episode.Ending
 
 @dataclass(frozen=True)
 class Options(cli.PolicyOptions):
-    """Let one robot walk along a lane, without noise or pushes, and film it."""
+    """Film one robot walking along a lane, without noise or pushes."""
 
     agent: Agent = "trained"
     """trained: a policy; stand: hold the nominal pose; random: the noise of an untrained policy"""
@@ -85,18 +85,18 @@ class Options(cli.PolicyOptions):
 
 
 class Recording(NamedTuple):
-    """What was seen of one robot until its episode or the time ended."""
+    """One robot until the end of its episode or of the time."""
 
     qpos: Float[np.ndarray, "T Q"]  # before each control step
     airborne: Bool[np.ndarray, "T F"]
     marks: Float[np.ndarray, "T F K 3"]  # m, where each foot may step; NaN where it may not
-    minds: "Minds | None"  # None: no trained policy
+    minds: "PolicyView | None"  # None: no trained policy
     progress: float  # m along the lane
     ending: str | None  # a field of episode.Ending; None: the time was over
 
 
-class Minds(NamedTuple):
-    """What a policy saw and did at each step; a blind one has a gate alone."""
+class PolicyView(NamedTuple):
+    """Inputs and inner state of a policy per step; a blind one has only a gate."""
 
     gate: Float[Array | np.ndarray, "*T D"]
     depth: Float[Array | np.ndarray, "*T H W"] | None  # D
@@ -105,12 +105,12 @@ class Minds(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What is kept of a control step."""
+    """The record of one control step."""
 
     qpos: Float[Array, " Q"]  # before it
     airborne: Bool[Array, " F"]
     marks: Float[Array, "F K 3"]
-    mind: Minds | None
+    mind: PolicyView | None
     progress: Float[Array, ""]  # m
     ending: dict[str, Bool[Array, ""]]
 
@@ -124,8 +124,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def play(options: Options) -> None:
-    """Let the robot walk, show it, and say how it went."""
-    _check(options)
+    """Simulate, film and summarise one episode."""
+    _check_options(options)
     if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
         jax.config.update("jax_platforms", "cpu")
     is_trained = options.agent == "trained"
@@ -133,8 +133,8 @@ def play(options: Options) -> None:
     c = sources.read_config(source) if source else Config()
     suffix = ".png" if options.stills else ".mp4"
     folder = source if source and sources.is_run(source) else Path()
-    out = cli.writable(options.out or folder / f"play{suffix}", suffix)
-    world = _world(options, c)
+    out = cli.prepare_output(options.out or folder / f"play{suffix}", suffix)
+    world = _build_world(options, c)
     train = sources.load(source, world).train if source and is_trained else None
     period = c.physics.control_period
     model = robot_scene.build(
@@ -154,13 +154,13 @@ def play(options: Options) -> None:
 
 
 def record(world: World, train: ppo.TrainState | None, options: Options) -> Recording:
-    """Return what one robot does until its episode or the time ends."""
+    """Simulate one robot until its episode or the time ends."""
     key_start, key_act = jax.random.split(jax.random.key(options.seed))
     robots = jax.jit(rollout.start, static_argnums=2)(world, key_start, 1)
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
     steps: list[Step] = []
     count = max(1, round(options.seconds / world.config.physics.control_period))
-    for key in _tracked(jax.random.split(key_act, count), "walking"):
+    for key in _with_progress(jax.random.split(key_act, count), "walking"):
         robots, step = _advance(world, options.agent, train, robots, key)
         steps.append(jax.tree.map(np.asarray, step))
         if any(steps[-1].ending.values()):
@@ -177,7 +177,7 @@ def record(world: World, train: ppo.TrainState | None, options: Options) -> Reco
 
 
 def summary(recording: Recording, command: float, period: float) -> str:
-    """Return how it went, in two lines."""
+    """Summarise a recording in two lines."""
     seconds = len(recording.qpos) * period
     left, right = recording.airborne.mean(axis=0)
     fate = ENDINGS[recording.ending] if recording.ending else "was still on its feet"
@@ -197,15 +197,15 @@ def _advance(
     key: PRNGKeyArray,
 ) -> tuple[rollout.Robots, Step]:
     """Step the robot with the agent's action."""
-    c = world.config.network
-    joints = len(world.physics.robot.joint_names)
-    memory, action, mind = robots.memory, jnp.zeros((1, joints)), None
+    c, mind = world.config.network, None
     if train is not None:
-        memory, policy = rollout.policy_step(rollout.networks(c, joints), train, robots)
-        action, mind = policy.mean[0], _mind(c, robots, policy)
-    elif agent == "random":
-        action = c.initial_std * jax.random.normal(key, action.shape)
-    after, outcome = rollout.env_step(world, robots, memory, action)
+        after, policy, outcome = rollout.step_policy(world, train, robots)
+        mind = _view_policy(c, robots, policy)
+    else:
+        action = jnp.zeros((1, world.physics.robot.num_joints))
+        if agent == "random":
+            action = c.initial_std * jax.random.normal(key, action.shape)
+        after, outcome = rollout.env_step(world, robots, robots.memory, action)
     step = Step(
         qpos=robots.env.body.qpos[0],
         airborne=outcome.measures.airborne[0],
@@ -217,10 +217,10 @@ def _advance(
     return after, step
 
 
-def _mind(c: config.Network, robots: rollout.Robots, policy: network.Output) -> Minds:
-    """Return what the first robot's policy sees and does."""
+def _view_policy(c: config.Network, robots: rollout.Robots, policy: network.Output) -> PolicyView:
+    """Collect what the first robot's policy sees and does."""
     feed, weights = robots.feed, policy.attention
-    return Minds(
+    return PolicyView(
         gate=policy.gate[0, 0],
         depth=None if feed is None else feed.images(c)[0].astype(jnp.float32),
         seen=jnp.zeros((), bool) if feed is None else feed.seen[0],
@@ -228,8 +228,8 @@ def _mind(c: config.Network, robots: rollout.Robots, policy: network.Output) -> 
     )
 
 
-def _check(options: Options) -> None:
-    """Refuse numbers that make no film."""
+def _check_options(options: Options) -> None:
+    """Refuse options that give no film."""
     if not 0.0 < options.seconds <= MAX_SECONDS:
         raise ConfigError(f"--seconds must be above 0, up to {MAX_SECONDS:g}: {options.seconds:g}")
     if not math.isfinite(options.command):
@@ -238,12 +238,12 @@ def _check(options: Options) -> None:
         raise ConfigError(f"--stills must not be below 0: {options.stills}")
 
 
-def _world(options: Options, c: Config) -> World:
-    """Return the world with one lane, and with what the run does not say about walking."""
+def _build_world(options: Options, c: Config) -> World:
+    """Build a world of one lane, with evaluation settings."""
     c = dataclasses.replace(
         c, terrain=dataclasses.replace(c.terrain, name=options.terrain or c.terrain.name)
     )
-    atlas = _lane(c.terrain, options)
+    atlas = _build_lane(c.terrain, options)
     c = protocol.evaluation_config(c, seconds=options.seconds + 1.0)  # it does not end by itself
     c = dataclasses.replace(
         c, command=dataclasses.replace(c.command, lane_vx=(options.command, options.command))
@@ -251,8 +251,8 @@ def _world(options: Options, c: Config) -> World:
     return build_world(c, "mujoco").replace(lanes=atlas)
 
 
-def _lane(c: config.Terrain, options: Options) -> Atlas:
-    """Return the one lane that the options name.
+def _build_lane(c: config.Terrain, options: Options) -> Atlas:
+    """Build the lane that the options name.
 
     Raises:
         ConfigError: there is no such terrain, kind or level.
@@ -260,34 +260,34 @@ def _lane(c: config.Terrain, options: Options) -> Atlas:
     atlas = lanes.build(c)
     kind = options.kind or atlas.kinds[0]
     if kind not in atlas.kinds:
-        raise ConfigError(config.unknown("kind", kind, list(atlas.kinds)))
+        raise ConfigError(config.describe_unknown("kind", kind, list(atlas.kinds)))
     level = atlas.levels // 2 if options.level is None else options.level
     if isinstance(level, str):
         named = lanes.named_sizes(c, kind)
         if not named:
             raise ConfigError(f"'{kind}' has no level '{level}'; take 0 to {atlas.levels - 1}")
-        return lanes.single(c, kind, named[level])
+        return lanes.build_single(c, kind, named[level])
     if not 0 <= level < atlas.levels:
         raise ConfigError(f"--level must be 0 to {atlas.levels - 1}, not {level}")
     if atlas.sizes.size == 1:
         return atlas
-    return lanes.single(c, kind, float(atlas.sizes[level, atlas.kinds.index(kind)]))
+    return lanes.build_single(c, kind, float(atlas.sizes[level, atlas.kinds.index(kind)]))
 
 
 def _film(
     canvas: robot_scene.Canvas, recording: Recording, moments: Int[np.ndarray, " n"], c: Config
 ) -> Iterator[robot_scene.Frame]:
-    """Yield the pictures of the robot after so many control steps, the panel beside it."""
+    """Yield pictures of the robot at regular steps, with the panel beside it."""
     period = c.physics.control_period
     points = robot_scene.camera_path(recording.qpos, period)
-    for t in _tracked(moments, "drawing"):
+    for t in _with_progress(moments, "drawing"):
         world = canvas.draw(recording.qpos[t], points[t], recording.marks[t])
         minds = recording.minds
         if minds is None:
             yield world
             continue
         upto = max(0, t + 1 - round(policy_overlay.SECONDS / period))
-        mind = policy_overlay.Mind(
+        mind = policy_overlay.PolicyView(
             depth=minds.depth[t] if minds.depth is not None and minds.seen[t] else None,
             attention=None if minds.attention is None else minds.attention[t],
             gates=np.asarray(minds.gate[upto : t + 1]),
@@ -298,7 +298,7 @@ def _film(
         yield np.concatenate([world, side], axis=1)
 
 
-def _tracked(items: Iterable[T], title: str) -> Iterable[T]:
+def _with_progress(items: Iterable[T], title: str) -> Iterable[T]:
     """Yield the items, with a progress bar on a terminal."""
     return track(items, title, transient=True, disable=not sys.stdout.isatty())
 

@@ -1,4 +1,4 @@
-"""Gather what is known about a run into one page: `python -m cref_jax.report --run runs/NAME`."""
+"""Report a run or a policy as one page: `python -m cref_jax.report --run runs/NAME`."""
 
 import cref_jax.system.startup  # noqa: F401
 
@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _policy_document(path: Path) -> str:
-    """Return the page of an exported policy.
+    """Build the page of an exported policy.
 
     Raises:
         ConfigError: it is none.
@@ -54,9 +54,9 @@ def _policy_document(path: Path) -> str:
     sections = [
         Section("What it is", _overview(content, path)),
         Section("Joints", _joints(content)),
-        Section("Where it comes from", run_page.provenance((origin["trained_by"],))),
-        Section("Settings", run_page.settings(origin["config"])),
-        Section("Evaluation", run_page.evaluation(record, "manifest.json"))
+        Section("Where it comes from", run_page.provenance_body((origin["trained_by"],))),
+        Section("Settings", run_page.settings_body(origin["config"])),
+        Section("Evaluation", run_page.evaluation_body(record, "manifest.json"))
         if record
         else Section("Evaluation", markup.note("None was there when it was exported.")),
     ]
@@ -67,19 +67,19 @@ def _policy_document(path: Path) -> str:
             (content["network"]["variant"], "network"),
         ]
     )
-    return markup.document(f"Policy {path.resolve().name}", lead, sections, run_page.foot())
+    return markup.document(f"Policy {path.resolve().name}", lead, sections, run_page.footer())
 
 
 def _overview(content: dict[str, Any], path: Path) -> Html:
-    """Return what an exported policy takes and where it is from."""
+    """Describe inputs and origin of an exported policy."""
     origin, rates, command = content["provenance"], content["rates"], content["command"]
     ends = zip(command["low"], command["high"], strict=True)
     limits = [f"{low:g} to {high:g}" for low, high in ends]
-    return markup.pairs(
+    return markup.definition_list(
         [
             ("folder", code(str(path))),
             ("run", str(origin["run"])),
-            ("exported", run_page.moment(origin["exported"])),
+            ("exported", run_page.format_time(origin["exported"])),
             ("control", f"{rates['control_hz']:g} Hz"),
             ("depth", f"{rates['depth_hz']:g} Hz" if content.get("depth") else "none: it is blind"),
             ("command forward", f"{limits[0]} m/s"),
@@ -91,7 +91,7 @@ def _overview(content: dict[str, Any], path: Path) -> Html:
 
 
 def _joints(content: dict[str, Any]) -> Html:
-    """Return the joints that the policy drives, and those that the robot has to hold."""
+    """Tabulate the joints driven by the policy and those held by the robot."""
     keys = ("default_rad", "low_rad", "high_rad", "kp", "kd", "effort_nm")
     titles = (
         "default, rad",
@@ -106,8 +106,10 @@ def _joints(content: dict[str, Any]) -> Html:
     rows = lambda joints: [(j["name"], *(number(j, key) for key in keys)) for j in joints]
     driven, held = content["joints"], content["held_joints"]
     return join(
-        markup.folded(f"{len(driven)} joints that it drives", markup.table(columns, rows(driven))),
-        markup.folded(
+        markup.collapsible(
+            f"{len(driven)} joints that it drives", markup.table(columns, rows(driven))
+        ),
+        markup.collapsible(
             f"{len(held)} joints that the robot holds", markup.table(columns, rows(held))
         ),
     )

@@ -1,4 +1,4 @@
-"""An exported policy on the robot's stand-in: `python -m cref_jax.sim2sim --policy policy/`."""
+"""An exported policy on the whole robot: `python -m cref_jax.sim2sim --policy policy/`."""
 
 import cref_jax.system.startup  # noqa: F401
 
@@ -19,7 +19,7 @@ from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, sim2sim_table
-from cref_jax.evaluation.crossing import Crossing
+from cref_jax.evaluation.crossing import LaneResult
 from cref_jax.evaluation.protocol import TRIAL_SECONDS
 from cref_jax.physics.simulation import Physics
 from cref_jax.policy import reader, sources
@@ -38,7 +38,7 @@ SIZE = (960, 540)  # pixels of it
 
 @dataclass(frozen=True)
 class Options(cli.DebugOption):
-    """Let an exported policy walk all 31 joints in MuJoCo C, through deploy.py alone."""
+    """Run an exported policy on the whole robot in MuJoCo C, through deploy.py alone."""
 
     policy: Path | None = None
     """what `python -m cref_jax.export` wrote, or its .zip (default: the bundled policy)"""
@@ -75,13 +75,15 @@ def main(arguments: list[str] | None = None) -> None:
         path = sources.find_policy(options.policy or sources.bundled_policy())
         policy = reader.read(path)
         physics = build_world(policy.config, "mujoco").physics
-        record = (_table if options.table else _one)(policy, path, physics, options)
+        record = (_run_table if options.table else _run_kind)(policy, path, physics, options)
         if options.out:
             options.out.write_text(json.dumps(record, indent=2) + "\n")
 
 
-def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
-    """Say what becomes of the trials on lanes of one kind, and return it."""
+def _run_kind(
+    policy: TrainedPolicy, path: Path, physics: Physics, options: Options
+) -> dict[str, Any]:
+    """Run, print and return the trials on lanes of one kind."""
     world = crossing.crossing_world(policy.config, physics, options.kind, options.size)
     trials = run_trials(world, path, options)
     result = summarize(trials, options)
@@ -91,7 +93,7 @@ def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) 
         print("the policy said: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
     record = {"stand_in": result._asdict(), "status": said}
     if options.compare:
-        theirs = in_training(policy, physics, options)
+        theirs = run_in_training(policy, physics, options)
         print(f"training simulation, JAX:   {theirs.line()}")
         record["training"] = theirs._asdict()
     if options.film:
@@ -100,10 +102,12 @@ def _one(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) 
     return record
 
 
-def _table(policy: TrainedPolicy, path: Path, physics: Physics, options: Options) -> dict[str, Any]:
-    """Say what becomes of the trials on flat ground and in each cell, and return it."""
-    cells: list[sim2sim_table.Cell] = []
-    asked = sim2sim_table.lanes()
+def _run_table(
+    policy: TrainedPolicy, path: Path, physics: Physics, options: Options
+) -> dict[str, Any]:
+    """Run, print and return the trials on flat ground and in each cell."""
+    cells: list[sim2sim_table.CellComparison] = []
+    asked = sim2sim_table.list_lanes()
     for name, lanes in asked.items():
         print(f"cell {len(cells) + 1} of {len(asked)}, {name}", flush=True)
         ours, theirs = [], []
@@ -112,16 +116,16 @@ def _table(policy: TrainedPolicy, path: Path, physics: Physics, options: Options
             on = dataclasses.replace(options, kind=kind, size=size, trials=count)
             world = crossing.crossing_world(policy.config, physics, kind, size)
             ours.append(summarize(run_trials(world, path, on), on))
-            theirs.append(in_training(policy, physics, on))
-        cells.append(sim2sim_table.Cell(name, tuple(theirs), tuple(ours)))
+            theirs.append(run_in_training(policy, physics, on))
+        cells.append(sim2sim_table.CellComparison(name, tuple(theirs), tuple(ours)))
         print(cells[-1].line(), flush=True)
-    Console().print(sim2sim_table.text(cells))
+    Console().print(sim2sim_table.to_table(cells))
     asdict = lambda crossings: [c._asdict() for c in crossings]
     return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
 
 
-def in_training(policy: TrainedPolicy, physics: Physics, options: Options) -> Crossing:
-    """Return what becomes of the same trials in the training simulation."""
+def run_in_training(policy: TrainedPolicy, physics: Physics, options: Options) -> LaneResult:
+    """Run the same trials in the training simulation."""
     return crossing.cross(
         policy.config, physics, policy.train, options.kind, options.size, options.trials,
         options.seed,
@@ -129,15 +133,17 @@ def in_training(policy: TrainedPolicy, physics: Physics, options: Options) -> Cr
 
 
 def run_trials(world: World, path: Path, options: Options) -> list[Trial]:
-    """Return the trials of the policy there, on all cores."""
-    lanes = [lane_of(world, level) for level in range(world.lanes.levels)]
+    """Run the trials on all cores."""
+    lanes = [to_lane(world, level) for level in range(world.lanes.levels)]
     _, levels = crossing.crossing_lanes(options.trials)
-    jobs = list(zip(starts(world, options.seed, options.trials), levels.tolist(), strict=True))
+    jobs = list(
+        zip(initial_states(world, options.seed, options.trials), levels.tolist(), strict=True)
+    )
     return parallel.run(_Walker, (world.config, path, lanes, options.latency), jobs)
 
 
 class _Walker:
-    """Runs trials of one policy; policy and models are made once."""
+    """Runs trials of one policy; policy and models are built once."""
 
     def __init__(self, c: Config, path: Path, lanes: list[Lane], latency: float) -> None:
         self._contents = deploy.contents(path)
@@ -152,26 +158,26 @@ class _Walker:
         return run_trial(self._bodies[level], policy, start, TRIAL_SECONDS, self._disturbance)
 
 
-def lane_of(world: World, level: int = 0) -> Lane:
-    """Return a lane of a world that has one kind."""
+def to_lane(world: World, level: int = 0) -> Lane:
+    """Convert a lane of a world with one kind."""
     ground = world.lanes.tile(level, 0)
     heights, origin = robot_scene.window(ground)
     return Lane(heights, origin, ground.cell, world.lanes.end - world.config.episode.lane_end)
 
 
-def starts(world: World, seed: int, count: int) -> list[Start]:
-    """Return poses and commands of the trials of this seed, as data."""
+def initial_states(world: World, seed: int, count: int) -> list[Start]:
+    """Compute the initial poses and commands of the trials of this seed."""
     state = crossing.first_robots(world, seed, count).env
     qpos, speeds = np.asarray(state.body.qpos), np.asarray(state.command[:, 0])
-    driven = slice(7, 7 + len(world.physics.robot.joint_names))
+    driven = slice(7, 7 + world.physics.robot.num_joints)
     return [Start(x[:7], x[driven], float(v)) for x, v in zip(qpos, speeds, strict=True)]
 
 
-def summarize(trials: list[Trial], options: Options) -> Crossing:
+def summarize(trials: list[Trial], options: Options) -> LaneResult:
     """Count how many trials came to the end, and how the others ended."""
     causes = Counter(trial.ending for trial in trials)
     seconds = [trial.seconds for trial in trials if trial.ending == "finished"]
-    return Crossing(
+    return LaneResult(
         kind=options.kind,
         size_m=options.size,
         trials=len(trials),
@@ -183,7 +189,7 @@ def summarize(trials: list[Trial], options: Options) -> Crossing:
 
 
 def _film(out: Path, world: World, trial: Trial) -> None:
-    """Write what the robot did as a film."""
+    """Film a trial."""
     c, period = world.config, world.config.physics.control_period
     stride = max(1, round(1.0 / (FRAME_RATE * period)))
     points = robot_scene.camera_path(trial.qpos, period)

@@ -73,7 +73,7 @@ class Options(cli.DebugOption):
 
 @dataclass(frozen=True)
 class Command:
-    """Train a policy. Every setting of the run is an option, too."""
+    """Train a policy. Every setting of the run is also an option."""
 
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def parse(arguments: list[str]) -> tuple[Options, Config]:
-    """Return what the command line asks for.
+    """Parse the command line.
 
     The settings are the paper's, changed by the device's preset, by the experiment and by the
     command line, in this order; those of a run that is resumed are its own.
@@ -120,7 +120,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
 
 
 def _options(arguments: list[str]) -> Options:
-    """Parse the options alone: what they say decides what the settings begin with."""
+    """Parse the options alone, since they decide the defaults of the settings."""
     asked = [a for a in arguments if a not in ("-h", "--help")]
     options, _ = tyro.cli(Options, args=asked, return_unknown_args=True)
     return options
@@ -144,9 +144,9 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 
 
 def train(options: Options, c: Config) -> None:
-    """Train until the last iteration, Ctrl-C or SIGTERM, and keep what was learned."""
+    """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
     run = options.run_dir or run_dir.ROOT / _name(options)
-    mesh = devices.mesh_of(c, options.devices)
+    mesh = devices.choose_mesh(c, options.devices)
     threads = max(parallel.cores() // mesh.size, 1)
     # what is wrong with the terrain is said before anything is written
     world = jax.device_put(
@@ -162,14 +162,14 @@ def train(options: Options, c: Config) -> None:
                 report.say(_headline(run, c, options, first))
                 programs = Programs(world, mesh, report)
                 if first < c.run.iterations:
-                    programs.of(min(c.run.chunk, c.run.iterations - first))
+                    programs.get(min(c.run.chunk, c.run.iterations - first))
                 state = _first_state(world, mesh, steps, options)
                 state = trainer.run_chunks(world, state, steps, report, programs)
         _summary(run, c, state, options)
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
-    """Return how many iterations are done.
+    """Return the number of completed iterations.
 
     Raises:
         ConfigError: there is nothing to resume, or something that would be overwritten.
@@ -185,7 +185,7 @@ def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
 def _first_state(
     world: World, mesh: Mesh, steps: Checkpoints, options: Options
 ) -> iteration.RunState:
-    """Return the state to begin with: fresh, with what was learned, or of the newest checkpoint."""
+    """Build the first state: fresh, from --init, or of the newest checkpoint."""
     state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
     if options.init:
         policy = sources.load(options.init, world)
@@ -193,10 +193,10 @@ def _first_state(
             average = jax.tree.map(jnp.copy, policy.train.average)  # the actor gives its own away
             learned = policy.train.replace(average=average, iteration=state.train.iteration)
             return state.replace(train=learned)
-        return state.replace(train=warm_start.begin_as(state.train, policy))
+        return state.replace(train=warm_start.start_from_policy(state.train, policy))
     if not options.resume:
         return state
-    stored, here = steps.meta(), trainer.sharing(state, mesh)
+    stored, here = steps.meta(), trainer.describe_sharding(state, mesh)
     there = {name: stored.get(name, 1) for name in here}
     if there == here:
         return steps.restore(state)[0]
@@ -218,7 +218,7 @@ def _headline(run: Path, c: Config, options: Options, first: int) -> str:
 
 
 def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:
-    """Say what was learned and what to type next."""
+    """Print the evaluation and the next command."""
     if options.evaluate:
         physics = build_physics(c, options.engine)
         one = jax.device_put(trained.with_averaged_actor(state.train), jax.devices()[0])
@@ -228,14 +228,14 @@ def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) 
 
 
 def _with_short_options(c: Config, options: Options) -> Config:
-    """Return the settings with --num-envs, --iterations and --seed written in."""
+    """Apply --num-envs, --iterations and --seed to the settings."""
     short = {name: getattr(options, name) for name in ("num_envs", "iterations", "seed")}
     given = {name: value for name, value in short.items() if value is not None}
     return dataclasses.replace(c, run=dataclasses.replace(c.run, **given))
 
 
 def _with_init(c: Config, options: Options) -> Config:
-    """Return the settings of a run that begins as `--init`.
+    """Adapt the settings to a run that begins as --init.
 
     Raises:
         ConfigError: it has another network, or there is something to resume as well.
@@ -254,7 +254,7 @@ def _with_init(c: Config, options: Options) -> Config:
 
 
 def _has_critic(init: Path, c: Config) -> bool:
-    """Return whether everything that a training learns is in `init`, and not the actor alone."""
+    """Return whether `init` holds everything that is trained, not the actor alone."""
     theirs = sources.read_config(init)
     read_out = theirs.ppo.readout_weight > 0.0, c.ppo.readout_weight > 0.0
     whole = sources.is_run(init) or learner_file.is_learner(init)

@@ -1,4 +1,4 @@
-"""Draw what `make bench ARGS="--out bench.json"` measured: `python experiments/bench.py`."""
+"""Plot the figures of `make bench ARGS="--out bench.json"`: `python experiments/bench.py`."""
 
 import json
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
 class Options:
-    """Draw each stage's time a robot step, and its share of what the machine allows."""
+    """Plot the time of each stage per robot step, and its share of the machine's bound."""
 
     measured: Path = HERE / "bench.json"
-    """what the benchmark wrote"""
+    """JSON file written by the benchmark"""
     out: Path = HERE / "figures" / "bench.png"
-    """the picture to write"""
+    """image to write"""
 
 
 def main() -> None:
-    """Read the figures and draw them."""
+    """Read the figures and plot them."""
     options = tyro.cli(Options)
-    found = json.loads(options.measured.read_text())
+    record = json.loads(options.measured.read_text())
     figure, (times, shares) = plt.subplots(
         1, 2, figsize=(11, 5), sharey=True, constrained_layout=True
     )
-    stages = list(dict.fromkeys(row["stage"] for row in found["rows"]))[::-1]
-    counts = sorted({row["robots"] for row in found["rows"]})
+    stages = list(dict.fromkeys(row["stage"] for row in record["rows"]))[::-1]
+    counts = sorted({row["robots"] for row in record["rows"]})
     for k, count in enumerate(counts):
-        rows = [row for row in found["rows"] if row["robots"] == count]
+        rows = [row for row in record["rows"] if row["robots"] == count]
         height = 0.8 / len(counts)
         y = [stages.index(row["stage"]) + (k - 0.5 * (len(counts) - 1)) * height for row in rows]
         microseconds = [1e6 * row["seconds"] / count for row in rows]
@@ -42,16 +42,16 @@ def main() -> None:
         share = [100.0 * (row["share"] or 0.0) for row in rows]
         shares.barh(y, share, height)
     times.set_yticks(range(len(stages)), stages)
-    times.set_xlabel("us for a control step of a robot, on all cores")
+    times.set_xlabel("us per control step of a robot, on all cores")
     times.legend(loc="center right")
-    shares.set_xlabel("% of what the machine allows, where that is known")
-    figure.suptitle(_title(found))
+    shares.set_xlabel("% of the machine's bound, where known")
+    figure.suptitle(_title(record))
     figure.savefig(options.out, dpi=100)
 
 
-def _title(found: dict[str, Any]) -> str:
-    products = found["rates"]["products"] / 1e9
-    return f"{found['terrain']}, {found['machine']}, {products:,.0f} GFLOP/s a device"
+def _title(record: dict[str, Any]) -> str:
+    products = record["rates"]["products"] / 1e9
+    return f"{record['terrain']}, {record['machine']}, {products:,.0f} GFLOP/s per device"
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""How many pixels a depth value should be taken from: `python experiments/camera_lab.py`.
+"""Effect of the depth camera's pixel window: `python experiments/camera_lab.py`.
 
-A camera with one ray per pixel sees salt and pepper over holes smaller than a pixel's distance on
-the ground. The policy is run on scenes full of such holes, other ones than those of `--suite ood`,
-with the nearest of 1 x 1, 3 x 3 and 5 x 5 pixels in place of each.
+A camera with one ray per pixel sees salt-and-pepper noise over holes smaller than the pixel spacing
+on the ground. The policy is run on scenes full of such holes, different from those of `--suite
+ood`, with each pixel replaced by the nearest of 1 x 1, 3 x 3 and 5 x 5 pixels.
 """
 
 import json
@@ -25,40 +25,40 @@ SCENES = Path(__file__).parent / "holes"
 
 @dataclass(frozen=True)
 class Options:
-    """Compare windows of the depth camera without any training."""
+    """Compare windows of the depth camera, without training."""
 
     policy: Path | None = None
-    """what `python -m cref_jax.export` wrote; the bundled policy when left out"""
+    """output of `python -m cref_jax.export` (default: the bundled policy)"""
     windows: tuple[int, ...] = (1, 3, 5)
-    """pixels, odd"""
+    """window sizes in pixels, odd"""
     trials: int = 16
-    """of each scene"""
+    """trials per scene"""
     seed: int = 0
-    """of starts and commands"""
+    """random seed of starts and commands"""
 
 
 def main() -> None:
-    """Print how many trials come to the end, by scene and window."""
+    """Print the number of successful trials by scene and window."""
     options = tyro.cli(Options)
     scenes = {path.stem: scene_files.load(path) for path in sorted(SCENES.glob("*.toml"))}
     print("| window | " + " | ".join(scene.title for scene in scenes.values()) + " | all |")
     for window in options.windows:
         with tempfile.TemporaryDirectory() as folder:
-            path = with_window(
+            path = copy_with_window(
                 sources.find_policy(options.policy or sources.bundled_policy()),
                 window,
                 Path(folder) / "policy",
             )
-            found = scene_suite.run_scenes(path, options.trials, 0, options.seed, scenes=scenes)
-        counts = [scene.successes for scene in found.scenes]
+            result = scene_suite.run_scenes(path, options.trials, 0, options.seed, scenes=scenes)
+        counts = [scene.successes for scene in result.scenes]
         total = f"{sum(counts)} of {len(counts) * options.trials}"
         print(
             f"| {window} x {window} | " + " | ".join(map(str, counts)) + f" | {total} |", flush=True
         )
 
 
-def with_window(policy: Path, window: int, out: Path) -> Path:
-    """Return a copy of an exported policy that sees the nearest of so many pixels."""
+def copy_with_window(policy: Path, window: int, out: Path) -> Path:
+    """Copy an exported policy to `out` with a depth window of `window` pixels, and return `out`."""
     shutil.copytree(policy, out)
     path = out / "manifest.json"
     manifest = json.loads(path.read_text())

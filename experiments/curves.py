@@ -1,4 +1,4 @@
-"""Draw the learning curves of runs: `python experiments/curves.py runs/A runs/B --out flat.png`."""
+"""Plot the learning curves of runs: `python experiments/curves.py runs/A runs/B --out flat.png`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +16,8 @@ from cref_jax.pages import training_log
 TITLES = {
     "episode/length_s": "episode length, s",
     "walk/speed_error": "speed error with exploration, m/s",
-    "walk/airborne": "share of time a foot is off the ground",
-    "walk/reward": "reward a step",
+    "walk/airborne": "share of time in the air per foot",
+    "walk/reward": "reward per step",
     "level/gap": "gap, mean level of 9",
     "level/platform": "platform, mean level of 9",
     "level/stairs_up": "stairs up, mean level of 9",
@@ -27,22 +27,22 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Options:
-    """Draw learning curves, one panel a measure."""
+    """Plot learning curves, one panel per measure."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """folders of runs"""
+    """run folders"""
     show: tuple[str, ...] = tuple(TITLES)[:4]
     """columns of the log, such as level/gap"""
     over: Literal["minutes", "samples"] = "minutes"
-    """of training, without pauses"""
+    """x axis: training time without pauses, or samples"""
     smooth: int = 10
-    """iterations that a point is the mean of"""
+    """iterations averaged per point"""
     out: Path = Path("curves.png")
-    """the picture to write"""
+    """image to write"""
 
 
 def main() -> None:
-    """Read each run's log and draw it."""
+    """Read the log of each run and plot it."""
     options = tyro.cli(Options)
     size = (4 * len(options.show), 3)
     figure, axes = plt.subplots(1, len(options.show), figsize=size, constrained_layout=True)
@@ -53,8 +53,8 @@ def main() -> None:
         over = log.minutes() if options.over == "minutes" else millions
         for axis, name in zip(axes, options.show, strict=True):
             mean = training_log.smooth(log, name, options.smooth)
-            whole = slice(options.smooth - 1, None)
-            axis.plot(over[whole], mean[whole], label=f"{run.name}, {millions[-1]:.1f} M")
+            full = slice(options.smooth - 1, None)
+            axis.plot(over[full], mean[full], label=f"{run.name}, {millions[-1]:.1f} M")
     for axis, name in zip(axes, options.show, strict=True):
         axis.set_title(TITLES.get(name, name), fontsize=10)
         axis.set_xlabel("minutes" if options.over == "minutes" else "samples, M")

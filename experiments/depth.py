@@ -1,7 +1,7 @@
-"""Draw what the robot sees: `python experiments/depth.py`.
+"""Draw depth images of each kind of terrain: `python experiments/depth.py`.
 
-It stands at the nominal pose, 0.6 m before the first obstacle of each kind of lane, with one of
-the middle sizes; at last it lifts a knee into the view. Takes seconds.
+The robot stands in the nominal pose, 0.6 m before the first obstacle of each kind of lane at a
+medium size; in the last image it lifts a knee into view. Takes seconds.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from cref_jax import config, depth, robot, terrain
 from cref_jax.robot import kinematics
 from cref_jax.terrain import lanes
 
-BEFORE = 0.6  # m, from the pelvis to the first column that is not at z = 0
+BEFORE = 0.6  # m, from the pelvis to the first column not at z = 0
 LEVEL = 5  # of 0 to 9
 
 
@@ -28,24 +28,24 @@ class Options:
     """Draw the depth image of each kind of terrain."""
 
     out: Path = Path(__file__).parent / "figures" / "depth.png"
-    """the picture to write"""
+    """image to write"""
 
 
 def main() -> None:
-    """Render one image a kind and draw them side by side."""
+    """Render one image per kind and draw them side by side."""
     options = tyro.cli(Options)
     c = config.Config()
     atlas = lanes.build(config.Terrain(name="mixed"))
     figure, axes = plt.subplots(2, 4, figsize=(11, 4.6), constrained_layout=True)
     views = {
-        f"{name}, {atlas.sizes[LEVEL, kind]:.2f}" + " m" * (name != "slope"): view(
+        f"{name}, {atlas.sizes[LEVEL, kind]:.2f}" + " m" * (name != "slope"): render_view(
             c, atlas.tile(LEVEL, kind), lift=0.0
         )
         for kind, name in enumerate(atlas.kinds)
     }
-    views["a knee lifted"] = view(c, atlas.tile(LEVEL, atlas.kinds.index("flat")), lift=1.0)
-    for axis, (title, seen) in zip(axes.flat, views.items(), strict=True):
-        image = axis.imshow(seen, cmap="viridis_r", vmin=0.5, vmax=c.camera.d_max)
+    views["knee lifted"] = render_view(c, atlas.tile(LEVEL, atlas.kinds.index("flat")), lift=1.0)
+    for axis, (title, metres) in zip(axes.flat, views.items(), strict=True):
+        image = axis.imshow(metres, cmap="viridis_r", vmin=0.5, vmax=c.camera.d_max)
         axis.set_title(title)
         axis.set_axis_off()
     figure.colorbar(image, ax=axes, label="depth, m")
@@ -53,8 +53,8 @@ def main() -> None:
     print(f"wrote {options.out}")
 
 
-def view(c: config.Config, ground: terrain.Terrain, lift: float) -> np.ndarray:
-    """Return the depth image, m, before the first obstacle, one hip bent by `lift`, rad."""
+def render_view(c: config.Config, ground: terrain.Terrain, lift: float) -> np.ndarray:
+    """Render the depth image before the first obstacle, m, with one hip flexed by `lift`, rad."""
     x2 = robot.load(c.robot)
     x = np.arange(0.0, 6.0, ground.cell) + 0.5 * ground.cell
     heights = np.asarray(terrain.height_at(ground, jnp.stack([x, 0.0 * x], 1)))

@@ -1,4 +1,4 @@
-"""Draw what a foot may step on: `python experiments/footholds.py`."""
+"""Draw foothold candidates on several obstacles: `python experiments/footholds.py`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +22,16 @@ BEFORE = 0.2  # m from the sole's centre to the obstacle
 
 @dataclass(frozen=True)
 class Options:
-    """Draw the candidates of a foot that lifts off before stairs, a gap and a slope."""
+    """Draw the candidates of a foot at liftoff before stairs, a gap and a slope."""
 
     command: float = 0.6
-    """forward command, m/s"""
+    """commanded forward speed, m/s"""
     out: Path = Path(__file__).parent / "figures" / "footholds.png"
-    """the picture to write"""
+    """image to write"""
 
 
 def main() -> None:
-    """Draw one picture an obstacle."""
+    """Draw one panel per obstacle."""
     options = tyro.cli(Options)
     figure, axes = plt.subplots(2, 2, figsize=(10, 6.4), constrained_layout=True)
     for axis, (kind, size) in zip(axes.flat, SIZES.items(), strict=True):
@@ -42,27 +42,27 @@ def main() -> None:
 
 
 def draw(axis: Axes, kind: str, size: float, command: float) -> None:
-    """Draw the ground, the buffer's points and the windows' means in the foot frame."""
+    """Draw the ground, the buffer points and the window means in the foot frame."""
     c = config.Config()
-    ground = lanes.single(config.Terrain(name="mixed"), kind, size).tile(0, 0)
+    ground = lanes.build_single(config.Terrain(name="mixed"), kind, size).tile(0, 0)
     lane_x = np.arange(0.0, 6.0, 0.002)
     height = terrain.height_at(ground, jnp.stack([lane_x, jnp.zeros(lane_x.size)], axis=-1))
     start = lane_x[np.argmax(np.abs(height) > 1e-6)] - BEFORE
     sole = jnp.broadcast_to(jnp.array([start, 0.0, 0.0]), (2, 3))
-    found = footholds.candidates(ground, sole, jnp.zeros(2), jnp.float32(command), c.foothold)
+    candidates = footholds.candidates(ground, sole, jnp.zeros(2), jnp.float32(command), c.foothold)
 
     x = (np.arange(c.foothold.points[0]) + 0.5) * c.foothold.spacing[0]
     gate = c.foothold.gate_time * command
     z = terrain.height_at(ground, jnp.stack([start + x, jnp.zeros(x.size)], axis=-1))
-    ok = np.asarray(found.accepted[0])
-    mean = np.stack([found.x[0], found.z[0]])
-    refused = ~ok & (mean[0] >= gate)  # of the others no point is left
+    ok = np.asarray(candidates.accepted[0])
+    mean = np.stack([candidates.x[0], candidates.z[0]])
+    rejected = ~ok & (mean[0] >= gate)  # the other windows have no point beyond the gate
     axis.plot(lane_x - start, height, color="0.6", lw=1, zorder=1)
     axis.plot([-0.095, 0.095], [0.0, 0.0], color="k", lw=5, solid_capstyle="butt", label="sole")
     axis.scatter(x[x >= gate], z[x >= gate], s=5, color="tab:blue", label="points", zorder=2)
-    axis.scatter(x[x < gate], z[x < gate], s=5, color="0.8", label="points nearer than the gate")
+    axis.scatter(x[x < gate], z[x < gate], s=5, color="0.8", label="points before the gate")
     axis.scatter(
-        *mean[:, refused], marker="x", color="red", s=20, lw=0.7, label="refused", zorder=3
+        *mean[:, rejected], marker="x", color="red", s=20, lw=0.7, label="rejected", zorder=3
     )
     axis.scatter(*mean[:, ok], color="green", s=40, label="accepted", zorder=4)
     axis.axvline(gate, color="0.7", lw=0.8, ls="--")

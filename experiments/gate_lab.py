@@ -1,18 +1,18 @@
-"""When the policy leans on its memory (Sec. III-B): `python experiments/gate_lab.py`.
+"""When the policy relies on its memory (Sec. III-B): `python experiments/gate_lab.py`.
 
-Writes gate.png and gate.csv: the highway gate beta of Eq. 16, its mean over the channels, grouped
-by what the robot walks on, by how its feet touch the ground, and by its posture; and one robot's
-gate over time. Near 1 the action leans on memory, near 0 on what is sensed now. 140 robots take two
-minutes on 4 busy cores, 40 s of which are compilation.
+Writes gate.png and gate.csv: the highway gate beta of Eq. 16, mean over channels, grouped by
+terrain, contact phase and posture; and the gate of one robot over time. Near 1 the action relies on
+memory, near 0 on the current observation. 140 robots take two minutes on 4 busy cores, 40 s of
+which are compilation.
 
-Robots walk lanes of every kind at their medium size (Table II) at one command. Terrain: the lane of
-that name, from 0.5 m before its first obstacle to the end of its last; a flight of stairs counts by
-its direction. Phase: flight, no foot touches; single and double support. Posture: risky, |roll| or
-|pitch| above 0.20 rad; stable, the rest. Phase and posture are those of every step on every lane.
-Not counted: the first second, when the memory fills, and what follows a robot's end.
+Robots walk lanes of every kind at their medium size (Table II) with one command. Terrain: the lane
+of that name, from 0.5 m before its first obstacle to the end of its last; stairs are split by
+direction. Phase: flight (no foot in contact), single and double support. Posture: risky (|roll| or
+|pitch| above 0.20 rad) or stable. Phase and posture are taken from every step on every lane.
+Excluded: the first second, when the memory fills, and all steps after a robot's first episode.
 
 The paper finds higher gates on stairs than on flat ground, in flight than in support, and in risky
-than in stable postures. n counts robots' steps of 20 ms, which are far from independent.
+than in stable postures. n counts steps of 20 ms over all robots, which are far from independent.
 """
 
 from collections.abc import Iterator
@@ -35,13 +35,13 @@ from cref_jax.config import Config
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import recorder
-from cref_jax.evaluation.recorder import Moment, Watched
+from cref_jax.evaluation.recorder import Moment, StepRecords
 from cref_jax.system import jax_setup
 from cref_jax.terrain import Terrain, cross_section
 
 RISKY = 0.20  # rad, |roll| or |pitch| above it, Sec. III-B
 WARM_UP = 1.0  # s; assumed: the memory is empty at first and the robot stands
-FEW = 100  # steps; a group of fewer is marked
+FEW = 100  # steps; smaller groups are marked
 GROUPS = {
     "terrain": ("flat", "stairs up", "stairs down", "gap", "platform", "rough", "slope"),
     "phase": ("flight", "single support", "double support"),
@@ -55,31 +55,31 @@ class Options(recorder.Options):
     """Group the highway gate of a policy by terrain, contact phase and posture."""
 
     run: Path | None = None
-    """runs/NAME; the newest one when left out, or the bundled policy where there is none"""
+    """runs/NAME (default: the newest run, or the bundled policy without runs)"""
     policy: Path | None = None
-    """an exported policy (a directory or .zip) instead of a run"""
+    """exported policy (a directory or .zip) instead of a run"""
     kind: str | None = None
-    """of the lane that one robot is traced on; when left out, of the policy's own terrain"""
+    """kind of lane on which one robot is traced (default: one of the policy's own terrain)"""
     seconds: float = 20.0
-    """length of a trial"""
+    """length of a trial, s"""
     out: Path = Path("gate.png")
-    """the picture to write; the table stands beside it"""
+    """image to write; the table is written beside it as .csv"""
 
 
 class Step(NamedTuple):
-    """What is kept of a control step of E robots, before it: what the gate was worked out for."""
+    """Data recorded per control step of E robots; the state is that before the step."""
 
-    gate: Float[Array, "E 3"]  # of the channels: mean, 10th and 90th percentile
+    gate: Float[Array, "E 3"]  # over channels: mean, 10th and 90th percentile
     airborne: Bool[Array, "E F"]
     pose: Float[Array, "E 7"]  # of the base: m, quaternion
 
 
 class Row(NamedTuple):
-    """The gate in one state."""
+    """Statistics of the gate in one state."""
 
     group: str
     state: str
-    n: int  # steps of all robots
+    n: int  # steps over all robots
     robots: int
     mean: float
     q25: float
@@ -88,49 +88,49 @@ class Row(NamedTuple):
 
     @property
     def note(self) -> str:
-        """What a reader of the numbers must know."""
+        """A warning for small groups."""
         return f"n below {FEW}" if self.n < FEW else ""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; a mistake in it is one line and exit code 2."""
+    """Run the command line; a user error prints one line and exits with code 2."""
     options = tyro.cli(Options, args=arguments)
     with cli.one_line_errors(options.debug):
         jax_setup.prepare()
-        out = cli.writable(options.out, ".png")
+        out = cli.prepare_output(options.out, ".png")
         policy, world = recorder.open_policy(options.run, options.policy, options.engine)
         c = policy.config
-        check(c)
-        kind = recorder.kind_of_lane(c, options.kind)
-        world = recorder.place_robots(c, world, recorder.medium_lanes(c), options.command)
+        check_variant(c)
+        kind = recorder.choose_kind(c, options.kind)
+        world = recorder.make_trial_world(c, world, recorder.medium_lanes(c), options.command)
         count = recorder.default_num_envs(options.num_envs, on_accelerator=4096)
-        robots = recorder.begin(world, options.seed, count)
-        steps = recorder.steps_of(options.seconds, c)
-        watched = recorder.watch(world, policy.train, robots, steps, look)
-        found = list(rows(world, watched))
-        recorder.write_table(
-            out.with_suffix(".csv"), COLUMNS, ((*row, row.note) for row in found if row.n)
+        robots = recorder.start_robots(world, options.seed, count)
+        steps = recorder.count_steps(options.seconds, c)
+        watched = recorder.record(world, policy.train, robots, steps, record_step)
+        rows = list(make_rows(world, watched))
+        recorder.write_csv(
+            out.with_suffix(".csv"), COLUMNS, ((*row, row.note) for row in rows if row.n)
         )
-        draw(out, found, world, watched, kind)
-        for row in found:
-            print(line(row))
+        draw(out, rows, world, watched, kind)
+        for row in rows:
+            print(format_row(row))
         print(f"wrote {out} and {out.with_suffix('.csv')}")
 
 
-def check(c: Config) -> None:
-    """Refuse a policy without a gate; say what that of a blind one blends.
+def check_variant(c: Config) -> None:
+    """Check that the policy has a gate; print the inputs of a blind policy's gate.
 
     Raises:
-        ConfigError: the policy has no gate.
+        ConfigError: it has none.
     """
     if c.network.variant == "no_highway":
-        raise ConfigError("this policy has no gate: its variant is 'no_highway'; take any other")
+        raise ConfigError("this policy has no gate: its variant is 'no_highway'; use another")
     if c.network.variant == "blind":
-        print("a blind policy: its gate blends memory with proprioception, no depth")
+        print("blind policy: its gate blends memory with proprioception, without depth")
 
 
-def look(world: World, moment: Moment) -> Step:
-    """Return the gate, and the state that it was worked out for."""
+def record_step(world: World, moment: Moment) -> Step:
+    """Record the gate and the state for which it was computed."""
     state, gate = moment.robots.env, moment.policy.gate[0]
     low, high = jnp.percentile(gate, jnp.array([10.0, 90.0]), axis=1)
     return Step(
@@ -140,62 +140,62 @@ def look(world: World, moment: Moment) -> Step:
     )
 
 
-def rows(world: World, watched: Watched) -> Iterator[Row]:
-    """Yield the gate in each state of each group."""
+def make_rows(world: World, watched: StepRecords) -> Iterator[Row]:
+    """Yield the gate statistics of each state of each group."""
     seen = watched.seen
     counted = watched.alive.copy()
     counted[: round(WARM_UP / world.config.physics.control_period)] = False
     states = {
         "terrain": recorder.terrain_under(world.lanes, seen.pose[..., 0]),
-        "phase": phases(seen.airborne),
+        "phase": contact_phases(seen.airborne),
         "posture": postures(seen.pose[..., 3:]),
     }
     for group, names in GROUPS.items():
         for name in names:
-            yield summary(group, name, seen.gate[..., 0], counted & (states[group] == name))
+            yield summarize_state(group, name, seen.gate[..., 0], counted & (states[group] == name))
 
 
-def summary(
+def summarize_state(
     group: str, state: str, gate: Float[np.ndarray, "T E"], where: Bool[np.ndarray, "T E"]
 ) -> Row:
-    """Return the gate of the steps of one state; NaN where there are none."""
+    """Summarise the gate over the steps of one state; NaN without steps."""
     x = gate[where].astype(np.float64)
     quartiles = np.percentile(x, (25, 50, 75)) if x.size else np.full(3, np.nan)
     mean = float(x.mean()) if x.size else float("nan")
     return Row(group, state, x.size, int(where.any(axis=0).sum()), mean, *map(float, quartiles))
 
 
-def phases(airborne: Bool[np.ndarray, "*n F"]) -> Shaped[np.ndarray, "*n"]:
-    """Return how many feet touch the ground, in words."""
+def contact_phases(airborne: Bool[np.ndarray, "*n F"]) -> Shaped[np.ndarray, "*n"]:
+    """Name the contact phase: double support, single support or flight."""
     return np.array(["double support", "single support", "flight"])[airborne.sum(axis=-1)]
 
 
 def postures(rotation: Float[np.ndarray, "*n 4"]) -> Shaped[np.ndarray, "*n"]:
-    """Return whether the base is tilted by more than RISKY in roll or pitch."""
+    """Name the posture: risky if |roll| or |pitch| of the base is above RISKY, else stable."""
     w, x, y, z = np.moveaxis(rotation, -1, 0)
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
     return np.where((np.abs(roll) > RISKY) | (np.abs(pitch) > RISKY), "risky", "stable")
 
 
-def line(row: Row) -> str:
-    """Return one state in one line for people."""
-    said = f"{row.group:8} {row.state:15} n {row.n:7d} of {row.robots:4d} robots"
+def format_row(row: Row) -> str:
+    """Format a row as one line of text."""
+    text = f"{row.group:8} {row.state:15} n {row.n:7d} of {row.robots:4d} robots"
     if not row.n:
-        return f"{said}: never"
-    said += f": mean {row.mean:.3f}, quartiles {row.q25:.3f} {row.median:.3f} {row.q75:.3f}"
-    return said + (f" ({row.note})" if row.note else "")
+        return f"{text}: never"
+    text += f": mean {row.mean:.3f}, quartiles {row.q25:.3f} {row.median:.3f} {row.q75:.3f}"
+    return text + (f" ({row.note})" if row.note else "")
 
 
-def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str) -> None:
-    """Draw the groups, and one robot's gate over the ground that it walked on."""
+def draw(out: Path, rows: list[Row], world: World, watched: StepRecords, kind: str) -> None:
+    """Draw the groups, and one robot's gate, contacts and ground over time."""
     figure = plt.figure(figsize=(12, 5), constrained_layout=True)
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.5), height_ratios=(4.0, 0.7, 2.0))
-    draw_groups(figure.add_subplot(grid[:, 0]), found)
+    draw_groups(figure.add_subplot(grid[:, 0]), rows)
     gate = figure.add_subplot(grid[0, 1])
     feet, ground = (figure.add_subplot(grid[row, 1], sharex=gate) for row in (1, 2))
     k = world.lanes.kinds.index(kind)
-    t, best = furthest(world, watched, k)
+    t, best = find_furthest(world, watched, k)
     if t.size:
         time = t * world.config.physics.control_period
         draw_gate(gate, time, watched.seen.gate[t, best])
@@ -208,26 +208,28 @@ def draw(out: Path, found: list[Row], world: World, watched: Watched, kind: str)
         for axis in (gate, feet):
             axis.tick_params(labelbottom=False)
         gate.set_title(
-            f"{recorder.name_of_lane(world, kind)}: the robot that came furthest", fontsize=9
+            f"{recorder.lane_name(world, kind)}: the robot that walked furthest", fontsize=9
         )
     else:
         gate.set_title(f"no robot on {kind}", fontsize=9)
     figure.savefig(out, dpi=90)
 
 
-def furthest(world: World, watched: Watched, kind: int) -> tuple[Int[np.ndarray, " t"], int]:
-    """Return the steps and the number of the robot that came furthest on a lane."""
+def find_furthest(
+    world: World, watched: StepRecords, kind: int
+) -> tuple[Int[np.ndarray, " t"], int]:
+    """Find the robot that walked furthest on a lane: its steps and its number."""
     x = np.where(watched.alive, watched.seen.pose[..., 0], -np.inf)
     x[:, recorder.round_robin_lanes(world.lanes, x.shape[1])[0] != kind] = -np.inf
     best = int(np.argmax(x.max(axis=0)))
     return np.flatnonzero(np.isfinite(x[:, best])), best
 
 
-def draw_groups(axis: Axes, found: list[Row]) -> None:
-    """Draw mean and quartiles of each state, a colour a group."""
+def draw_groups(axis: Axes, rows: list[Row]) -> None:
+    """Draw mean and quartiles of each state, in one colour per group."""
     colours = dict(zip(GROUPS, ("C0", "C1", "C2"), strict=True))
     labels, y = [], []
-    for k, row in enumerate(found):
+    for k, row in enumerate(rows):
         at = k + 0.8 * list(GROUPS).index(row.group)
         few = " !" if row.note and row.n else ""
         y.append(at)
@@ -236,25 +238,25 @@ def draw_groups(axis: Axes, found: list[Row]) -> None:
             axis.barh(at, row.q75 - row.q25, 0.5, row.q25, color=colours[row.group], alpha=0.35)
             axis.plot([row.median] * 2, [at - 0.25, at + 0.25], color=colours[row.group], lw=2)
             axis.plot(row.mean, at, "o", color=colours[row.group], ms=5)
-    ends = [x for row in found if row.n for x in (row.q25, row.q75, row.mean)]
+    ends = [x for row in rows if row.n for x in (row.q25, row.q75, row.mean)]
     if ends:
         margin = 0.05 * (max(ends) - min(ends)) + 1e-3
         axis.set_xlim(min(ends) - margin, max(ends) + margin)
     axis.set_yticks(y, labels, fontsize=8)
     axis.invert_yaxis()
     axis.grid(axis="x", alpha=0.3)
-    axis.set_xlabel("highway gate, mean of the channels (1: leans on memory)")
-    axis.set_title(f"dot: mean; line: median; bar: quartiles; !: n below {FEW} steps", fontsize=9)
+    axis.set_xlabel("highway gate, mean over channels (1: memory)")
+    axis.set_title(f"dot: mean; line: median; bar: quartiles; !: n below {FEW}", fontsize=9)
 
 
 def draw_gate(axis: Axes, time: Float[np.ndarray, " t"], gate: Float[np.ndarray, "t 3"]) -> None:
-    """Draw the mean of the channels, and say how far apart they are."""
+    """Draw the mean over channels; state the 10th to 90th percentile range of the channels."""
     mean, low, high = gate.T
     axis.plot(time, mean, color="C0", lw=1.2)
-    axis.set(ylabel="highway gate,\nmean of the channels")
+    axis.set(ylabel="highway gate,\nmean over channels")
     axis.grid(axis="y", alpha=0.3)
-    said = f"80 % of the channels lie in {low.mean():.2f} to {high.mean():.2f}"
-    axis.text(0.99, 0.97, said, transform=axis.transAxes, ha="right", va="top", size=8)
+    text = f"80 % of the channels are within {low.mean():.2f} to {high.mean():.2f}"
+    axis.text(0.99, 0.97, text, transform=axis.transAxes, ha="right", va="top", size=8)
     axis.set_ylim(top=axis.get_ylim()[1] + 0.15 * np.ptp(axis.get_ylim()))
 
 

@@ -48,7 +48,7 @@ def test_it_says_what_the_network_says_over_1000_steps_with_resets(variant):
     trained = policy(variant, config.Network())
     steps = recorded(1000, sees=variant != "blind")
     ours, worst = runtime(variant, config.Network(), rate_rad=[1e6] * J, beyond_rad=[1e6] * J), {}
-    expected = reference_vectors.reference(
+    expected = reference_vectors.compute_reference(
         trained.config.network, trained.train, ROBOT, trained.config.robot, steps
     )
     expected = {name: np.asarray(x) for name, x in expected.items()}
@@ -89,7 +89,7 @@ def test_a_window_shows_the_nearest_of_the_pixels_around_as_training_did():
     manifest, arrays = contents(policy("full", SMALL))
     manifest["depth"]["window"] = 3
     depth_image = np.random.default_rng(1).uniform(0.3, 2.9, (48, 64)).astype(np.float32)
-    nearest = np.asarray(depth.nearest_around(jnp.asarray(depth_image), 3))
+    nearest = np.asarray(depth.min_filter(jnp.asarray(depth_image), 3))
     np.testing.assert_allclose(
         tokens(deploy.Policy(manifest, arrays), depth_image), tokens(runtime(), nearest), atol=1e-6
     )

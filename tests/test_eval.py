@@ -7,7 +7,7 @@ import pytest
 
 from cref_jax import eval
 from cref_jax.eval import Options
-from cref_jax.evaluation import paper_results, scene_suite, tables
+from cref_jax.evaluation import paper_results, protocol, scene_results, scene_suite
 from cref_jax.policy import reader, sources
 
 
@@ -43,7 +43,7 @@ def test_a_scene_that_does_not_exist_is_met_with_the_nearest(capsys):
 
 def test_the_bundled_policy_is_judged_where_there_is_no_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert eval._sources(Options()) == [sources.bundled_policy()]
+    assert eval._resolve_sources(Options()) == [sources.bundled_policy()]
 
 
 def test_an_evaluation_of_another_suite_is_kept(tmp_path):
@@ -63,7 +63,7 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
 
     def judge(path, trials, stress, seed):
         asked.append((Path(path), trials, stress, seed))
-        return scene_suite.ood_verdict.verdict({}, {scene_suite.GOOD: {}})
+        return scene_results.build_verdict({}, {scene_suite.GOOD: {}})
 
     monkeypatch.setattr(scene_suite, "run_scenes", judge)
     bundled = sources.bundled_policy()
@@ -77,8 +77,8 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tables.evaluation, "block", lambda: 2)
-    monkeypatch.setattr(tables.evaluation, "TRIAL_SECONDS", 1.0)
+    monkeypatch.setattr(protocol, "robots_per_block", lambda: 2)
+    monkeypatch.setattr(protocol, "TRIAL_SECONDS", 1.0)
     bundled = str(sources.bundled_policy())
     eval.main(["--policy", bundled, bundled, "--num-envs", "2", "--out", str(tmp_path)])
     record = json.loads((tmp_path / "eval.json").read_text())
@@ -105,10 +105,10 @@ def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
 
 def test_a_policy_has_one_digest_as_a_run_and_exported():
     policy = reader.read(sources.bundled_policy())
-    digest = reader.digest(policy)
-    assert digest == reader.digest(policy._replace(iteration=1, run=Path("elsewhere")))
+    digest = reader.policy_digest(policy)
+    assert digest == reader.policy_digest(policy._replace(iteration=1, run=Path("elsewhere")))
     seen = policy.train.statistics.obs
     other = policy.train.replace(
         statistics=policy.train.statistics._replace(obs=seen.replace(mean=seen.mean + 1e-3))
     )
-    assert digest != reader.digest(policy._replace(train=other))
+    assert digest != reader.policy_digest(policy._replace(train=other))

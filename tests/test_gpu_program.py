@@ -44,17 +44,17 @@ class Counted(hlo.Program):
     def __init__(self):
         super().__init__("")
 
-    def kernels(self, turns):
+    def kernels(self, trip_count):
         newton, feed = frames(NEWTON, SUBSTEP, STEP), frames(FEED)
-        yield hlo.Kernel(newton, (), "fusion", 1000 * turns(newton), 8, 0)
+        yield hlo.Kernel(newton, (), "fusion", 1000 * trip_count(newton), 8, 0)
         yield hlo.Kernel(
             frames(("cref_jax/ppo/learner.py", "update")), (), "fusion", 1, 2_680_000_000, 0
         )
-        yield hlo.Kernel((), newton, "copy", 24 * turns(feed), 8, 0)
+        yield hlo.Kernel((), newton, "copy", 24 * trip_count(feed), 8, 0)
 
 
 def test_a_kernel_takes_the_longest_of_launch_bytes_and_products():
-    found = gpu_program.estimate(Counted(), Config(), H100)
+    found = gpu_program.estimate_stages(Counted(), Config(), H100)
     assert list(found) == ["physics: MJX, Newton", "update"]  # the longest first
     # 1000 launches in each of six iterations, and a copy for each frame that comes at 20 Hz in 24
     # steps of 20 ms: ten; 3 us each

@@ -6,7 +6,9 @@ from cref_jax import config, params
 
 
 def test_the_count_of_each_variant_is_that_of_its_layers():
-    counts = {variant: params.count(variant) for variant in typing.get_args(config.Variant)}
+    counts = {
+        variant: params.count_parameters(variant) for variant in typing.get_args(config.Variant)
+    }
     full, d = counts["full"], 128
     # norm 2 d, query, key, value and output d x d
     assert full["cross_attention"] == 2 * d + 4 * d * d
@@ -20,5 +22,5 @@ def test_the_count_of_each_variant_is_that_of_its_layers():
     assert lost == 8 * d * d + 2 * d
     assert {c["critic"] for c in counts.values()} == {full["critic"]}
     assert "depth_tokenizer" not in counts["blind"]
-    table = params.table(counts)
+    table = params.build_table(counts)
     assert [str(column.header) for column in table.columns] == ["part", *counts]

@@ -76,7 +76,7 @@ def test_a_level_is_a_size_of_the_terrain():
     # stairs rise from 0 to 0.20 m over 10 levels: level 3 is 3 * 0.20 / 9
     c = Config().terrain
     c = type(c)(name="stairs")
-    size = lambda **asked: float(play._lane(c, Options(**asked)).sizes[0, 0])
+    size = lambda **asked: float(play._build_lane(c, Options(**asked)).sizes[0, 0])
     assert size(level=3) == pytest.approx(0.20 / 3)
     assert size(level="ood", kind="stairs_down") == pytest.approx(0.23)
     assert size() == pytest.approx(5 * 0.20 / 9)
@@ -95,7 +95,7 @@ def test_the_summary_worked_by_hand():
 @pytest.mark.slow
 def test_the_nominal_pose_stands_for_a_moment_and_then_falls():
     options = Options(agent="stand", seconds=4.0)
-    world = play._world(options, Config())
+    world = play._build_world(options, Config())
     recording = play.record(world, None, options)
     assert recording.ending in ("tilted", "low", "hit")
     assert 0.5 < 0.02 * len(recording.qpos) < 4.0

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from cref_jax import config, deploy, depth, terrain
-from cref_jax.config import Camera, Config, ConfigError
+from cref_jax.config import Camera, Config
+from cref_jax.errors import ConfigError
 from cref_jax.policy import sources
 
 COMMANDS = (

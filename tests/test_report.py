@@ -132,7 +132,7 @@ def test_the_newest_evaluation_of_each_suite_is_shown(run):
     seen = shown(run)
     assert "95.5 %of 200 trials" in seen.text and "5.5 %of 200 trials" not in seen.words
     assert "Older evaluationseval_old.json" in seen.text
-    assert "It is of iteration 30; the run has come to 40." in seen.text
+    assert "Measured at iteration 30; the latest checkpoint is 40." in seen.text
     assert next(r for r in seen.rows if r[:2] == ["gap", "hard"])[3] == "124 of 200"
     assert seen.alone == []
 
@@ -151,7 +151,7 @@ def test_pictures_and_films_are_inside_while_there_is_room(run, monkeypatch):
     monkeypatch.setattr(run_page, "MOST_MEDIA", 2 * size + size // 2)
     seen = shown(run)
     assert len([r for r in seen.references if r.startswith("data:image/png")]) == 2
-    assert seen.text.count("is left out: there is room for") == 1
+    assert seen.text.count("is left out: it exceeds the limit of") == 1
 
 
 def test_markup_in_names_and_settings_stays_text(run):
@@ -174,7 +174,7 @@ def test_markup_in_names_and_settings_stays_text(run):
         (["--run", "{}/nothing"], "nothing is not a run: it has no config.json"),
         (["--run", "{}/file"], "file is not a run: it has no config.json"),
         (["--policy", "{}/nothing"], "nothing"),
-        (["--run", "{}/run", "--out", "{}/a.pdf"], "a page ends in .html"),
+        (["--run", "{}/run", "--out", "{}/a.pdf"], "the name of a page must end in .html"),
         (["--run", "{}/run", "--out", "{}/file/a.html"], "cannot write"),
         (["--run", "{}/run", "--policy", "{}/run"], "give --run or --policy, not both"),
     ],
@@ -193,7 +193,7 @@ def test_settings_that_are_no_json_are_one_line(run):
     with pytest.raises(ConfigError, match=r"config\.json cannot be read"):
         run_page.read(run)
     (run / "config.json").write_text("[1]")
-    with pytest.raises(ConfigError, match=r"config\.json holds no settings"):
+    with pytest.raises(ConfigError, match=r"config\.json has no settings"):
         run_page.read(run)
 
 
@@ -262,7 +262,7 @@ def test_a_log_without_a_line_or_a_file_is_refused(tmp_path):
 
 @given(count=st.integers(1, 5000), most=st.integers(2, 700))
 def test_thinning_keeps_the_ends_and_its_limit(count, most):
-    at = training_log.thinned(count, most)
+    at = training_log.even_indices(count, most)
     assert at[0] == 0 and at[-1] == count - 1
     assert len(at) == min(count, most) and (np.diff(at) > 0).all()
     assert len(at) < 2 or np.diff(at).max() - np.diff(at).min() <= 1
@@ -301,8 +301,8 @@ def test_a_restart_is_marked_where_it_was(run):
     starts = [ORIGIN | {"iteration": 0}, ORIGIN | {"iteration": 20}, ORIGIN]
     (run / "origin.jsonl").write_text("".join(json.dumps(s) + "\n" for s in starts))
     text = shown(run).text
-    assert "where the run was started anew (iteration 21)" in text
-    assert "It was started 3 times" in text
+    assert "Dotted lines mark restarts of the run (iteration 21)" in text
+    assert "The run was started 3 times" in text
 
 
 def test_a_long_log_does_not_make_a_large_page(tmp_path):

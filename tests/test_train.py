@@ -176,7 +176,7 @@ def test_devices_share_the_robots_and_hold_the_same_parameters(
 ):
     run(tmp_path / "two", "--devices", "2")
     c = run_dir.read_config(tmp_path / "two")
-    mesh = devices.mesh_of(c)
+    mesh = devices.choose_mesh(c)
     world = build_world(c)
     state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
     assert [s.data.shape[0] for s in state.robots.begins.addressable_shards] == [4, 4]
@@ -200,7 +200,7 @@ def test_robots_that_cannot_be_shared_out_are_refused(
 ):
     with pytest.raises(SystemExit) as end:
         run(tmp_path / "run", "--devices", asked)
-    said = "8 robots in 2 minibatches can be shared among 1, 2 of the 2 devices here"
+    said = "8 robots in 2 minibatches can be sharded over 1, 2 of the 2 devices here"
     assert end.value.code == 2 and said in capsys.readouterr().err
 
 

@@ -1,1 +1,1 @@
-"""Speed and memory, measured against peers and bounds."""
+"""Speed and memory, compared with peers and hardware bounds."""

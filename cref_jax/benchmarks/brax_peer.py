@@ -1,4 +1,4 @@
-"""brax's PPO on our environment: what a user would have who took that learner instead of ours."""
+"""brax's PPO on this environment, as a baseline for the learner of this package."""
 
 import functools
 
@@ -9,18 +9,18 @@ from cref_jax import config
 from cref_jax.env.brax_env import BraxEnv, mend_brax, wrap
 from cref_jax.system import parallel
 
-ITERATIONS = 4  # of each of two parts; the first part compiles
+ITERATIONS = 4  # in each of two parts; the first includes compilation
 
 
-def samples_per_second(c: config.Config) -> float:
-    """Time brax's PPO with our number of robots, horizon, epochs and minibatches.
+def measure_samples_per_second(c: config.Config) -> float:
+    """Measure brax's PPO with the same number of robots, horizon, epochs and minibatches.
 
-    Its networks have the hidden layers of our action head and critic and no memory, so that its
-    update is a lighter one. The configuration has to be that of a blind policy.
+    Its networks have the hidden layers of our action head and critic but no memory, so that its
+    update is lighter. The configuration must be that of a blind policy.
     """
     mend_brax()
-    seen: list[float] = []
-    robots = BraxEnv(c, threads=max(parallel.cores() // jax.device_count(), 1))  # of a device
+    rates: list[float] = []
+    robots = BraxEnv(c, threads=max(parallel.cores() // jax.device_count(), 1))  # per device
     train.train(
         robots,
         num_timesteps=2 * ITERATIONS * c.run.num_envs * c.ppo.horizon,
@@ -40,6 +40,6 @@ def samples_per_second(c: config.Config) -> float:
             value_hidden_layer_sizes=tuple(c.network.critic),
             value_obs_key="privileged_state",
         ),
-        progress_fn=lambda _, metrics: seen.append(float(metrics.get("training/sps", 0.0))),
+        progress_fn=lambda _, metrics: rates.append(float(metrics.get("training/sps", 0.0))),
     )
-    return seen[-1]
+    return rates[-1]

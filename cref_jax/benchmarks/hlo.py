@@ -1,7 +1,7 @@
-"""What a compiled program launches and moves, counted in the text of its optimised HLO.
+"""Kernel launches, memory traffic and products of a compiled program, from its optimised HLO text.
 
-Each instruction of a computation that no fusion has taken in is one kernel. A loop counts as often
-as it turns, which XLA knows of all but a few; of the branches of a conditional the largest counts.
+Each instruction outside a fusion is one kernel. The body of a loop counts once per trip; XLA knows
+the trip count of all but a few loops. Of the branches of a conditional, the largest counts.
 """
 
 import re
@@ -13,7 +13,7 @@ BYTES = {"pred": 1, "s8": 1, "u8": 1, "f16": 2, "bf16": 2, "s16": 2, "u16": 2}
 BYTES |= {"s32": 4, "u32": 4, "f32": 4, "s64": 8, "u64": 8, "f64": 8}
 NO_KERNEL = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all"}
 NO_KERNEL |= {"partition-id", "replica-id", "opt-barrier", "async-done", "copy-done"}
-TAKES_A_PART = {"slice", "dynamic-slice", "gather"}  # reads of its first operand what it returns
+PARTIAL_READS = {"slice", "dynamic-slice", "gather"}  # read only the returned part of operand 0
 
 _SHAPE = re.compile(r"\b(\w+)\[([\d,]*)\]")
 _INSTRUCTION = re.compile(r"\s+(ROOT )?%?([\w.\-]+) = (\(.*?\)|\S+) ([a-z][a-z\-]*)\((.*)$")
@@ -27,30 +27,30 @@ class Instruction(NamedTuple):
     shape: str
     operation: str
     operands: tuple[str, ...]
-    attributes: str  # the line from its first operand on
+    attributes: str  # the rest of the line, from the first operand
     is_root: bool
 
 
 class Frame(NamedTuple):
-    """A line of the source."""
+    """One frame of a source stack."""
 
     file: str
     function: str
 
 
 class Kernel(NamedTuple):
-    """A kernel of the program."""
+    """A kernel with its work per launch."""
 
-    stack: tuple[Frame, ...]  # innermost first; empty for what XLA has added
-    loop: tuple[Frame, ...]  # of the loop around it
-    operation: str  # or the name of the library's function
-    times: float  # how often it is launched
-    bytes: int  # read and written by one launch
-    flops: int  # of one launch's matrix products
+    stack: tuple[Frame, ...]  # innermost first; empty for kernels added by XLA
+    loop: tuple[Frame, ...]  # of the enclosing loop
+    operation: str  # or the name of the library function
+    times: float  # number of launches
+    bytes: int  # read and written per launch
+    flops: int  # of matrix products per launch
 
 
 class Program:
-    """A compiled program."""
+    """A compiled program, parsed from its HLO text."""
 
     def __init__(self, text: str) -> None:
         self._computations: dict[str, dict[str, Instruction]] = {}
@@ -65,19 +65,19 @@ class Program:
             elif head := re.match(r"(ENTRY )?%?([\w.\-]+) .*\{$", line):
                 current, table = self._computations.setdefault(head[2], {}), None
                 self._entry = head[2] if head[1] else self._entry
-            elif current is not None and (found := _instruction(line)):
-                current[found.name] = found
+            elif current is not None and (instruction := _parse_instruction(line)):
+                current[instruction.name] = instruction
 
-    def kernels(self, turns: Callable[[tuple[Frame, ...]], float]) -> Iterator[Kernel]:
+    def kernels(self, trip_count: Callable[[tuple[Frame, ...]], float]) -> Iterator[Kernel]:
         """Yield every kernel.
 
-        `turns` says, from its stack, how often a loop turns whose number XLA does not know, and in
-        what share of cases the largest branch of a conditional is taken.
+        `trip_count` maps a stack to the trip count of a loop that XLA does not know and to the
+        probability of the largest branch of a conditional.
         """
-        yield from self._kernels(self._entry, 1.0, (), turns)
+        yield from self._kernels(self._entry, 1.0, (), trip_count)
 
     def _kernels(
-        self, computation: str, times: float, loop: tuple[Frame, ...], turns: Callable
+        self, computation: str, times: float, loop: tuple[Frame, ...], trip_count: Callable
     ) -> Iterator[Kernel]:
         for i in self._computations[computation].values():
             if i.operation in NO_KERNEL:
@@ -85,15 +85,17 @@ class Program:
             stack = self._stack(i)
             if i.operation == "while":
                 known = re.search(r'known_trip_count":\{"n":"(\d+)"', i.attributes)
-                count = float(known[1]) if known else turns(stack)
-                yield from self._kernels(_called(i, "body"), times * count, stack, turns)
+                count = float(known[1]) if known else trip_count(stack)
+                yield from self._kernels(_callee(i, "body"), times * count, stack, trip_count)
             elif i.operation == "conditional":
-                branches = [x for x in _names(i.attributes) if x in self._computations]
+                branches = [x for x in _find_names(i.attributes) if x in self._computations]
                 largest = max(branches, key=lambda name: len(self._computations[name]))
-                yield from self._kernels(largest, times * turns(stack), stack or loop, turns)
+                yield from self._kernels(
+                    largest, times * trip_count(stack), stack or loop, trip_count
+                )
             elif i.operation in ("call", "async-start"):
-                inner = _called(i, "to_apply") or _called(i, "calls")
-                yield from self._kernels(inner, times, loop, turns)
+                inner = _callee(i, "to_apply") or _callee(i, "calls")
+                yield from self._kernels(inner, times, loop, trip_count)
             else:
                 moved, flops = self._traffic(computation, i), self._flops(computation, i)
                 library = re.search(r'custom_call_target="([^"]+)"', i.attributes)
@@ -101,103 +103,104 @@ class Program:
                 yield Kernel(stack, loop, name, times, moved, flops)
 
     def _stack(self, i: Instruction) -> tuple[Frame, ...]:
-        """Return the lines of the source that an instruction comes from, innermost first."""
-        number = _number("stack_frame_id", i.attributes)
-        if not number and i.operation == "fusion":  # then it is that of a part
-            inside = self._computations[_called(i, "calls")].values()
-            number = next((n for j in inside if (n := _number("stack_frame_id", j.attributes))), 0)
-        found = []
+        """Find the source stack of an instruction, innermost frame first."""
+        number = _find_id("stack_frame_id", i.attributes)
+        if not number and i.operation == "fusion":  # then a fused instruction has it
+            inside = self._computations[_callee(i, "calls")].values()
+            number = next((n for j in inside if (n := _find_id("stack_frame_id", j.attributes))), 0)
+        frames = []
         while number in self._tables["StackFrames"]:
             frame = self._tables["StackFrames"][number]
-            place = self._tables["FileLocations"][_number("file_location_id", frame)]
-            file = self._tables["FileNames"][_number("file_name_id", place)].strip('"')
-            function = self._tables["FunctionNames"][_number("function_name_id", place)].strip('"')
-            found.append(Frame(file, function))
-            number = _number("parent_frame_id", frame) - 1  # it is printed one higher
-        return tuple(found)
+            place = self._tables["FileLocations"][_find_id("file_location_id", frame)]
+            file = self._tables["FileNames"][_find_id("file_name_id", place)].strip('"')
+            function = self._tables["FunctionNames"][_find_id("function_name_id", place)].strip('"')
+            frames.append(Frame(file, function))
+            number = _find_id("parent_frame_id", frame) - 1  # printed with an offset of 1
+        return tuple(frames)
 
     def _flops(self, computation: str, i: Instruction) -> int:
-        """Return the work of the matrix products in one instruction."""
+        """Count the FLOPs of the matrix products in one instruction."""
         if i.operation == "fusion":
-            inner = _called(i, "calls")
+            inner = _callee(i, "calls")
             return sum(self._flops(inner, j) for j in self._computations[inner].values())
         if i.operation != "dot":
             return 0
-        left = _shapes(self._computations[computation][i.operands[0]].shape)[0][1]
+        left = _parse_shapes(self._computations[computation][i.operands[0]].shape)[0][1]
         summed = re.search(r"lhs_contracting_dims=\{([\d,]*)\}", i.attributes)
         depth = prod(left[int(k)] for k in summed[1].split(",") if k) if summed else 1
-        return 2 * prod(_shapes(i.shape)[0][1]) * depth
+        return 2 * prod(_parse_shapes(i.shape)[0][1]) * depth
 
     def _traffic(self, computation: str, i: Instruction) -> int:
-        """Return the bytes that one kernel reads and writes."""
+        """Count the bytes that one kernel reads and writes."""
         here = self._computations[computation]
-        if i.operation in TAKES_A_PART:
-            return 2 * _bytes(i.shape)
+        if i.operation in PARTIAL_READS:
+            return 2 * _count_bytes(i.shape)
         if i.operation == "dynamic-update-slice":
-            return 2 * _bytes(here[i.operands[1]].shape)
+            return 2 * _count_bytes(here[i.operands[1]].shape)
         if i.operation != "fusion":
-            return _bytes(i.shape) + sum(_bytes(here[o].shape) for o in i.operands if o in here)
-        inside = self._computations[_called(i, "calls")]
-        read = sum(_read(inside, j) for j in inside.values() if j.operation == "parameter")
+            operands = (here[o].shape for o in i.operands if o in here)
+            return _count_bytes(i.shape) + sum(map(_count_bytes, operands))
+        inside = self._computations[_callee(i, "calls")]
+        read = sum(_bytes_read(inside, j) for j in inside.values() if j.operation == "parameter")
         root = next(j for j in inside.values() if j.is_root)
         outputs = root.operands if root.operation == "tuple" else (root.name,)
-        return read + sum(_written(inside, name) for name in outputs)
+        return read + sum(_bytes_written(inside, name) for name in outputs)
 
 
-def _instruction(line: str) -> Instruction | None:
-    """Return what a line of a computation says."""
-    found = _INSTRUCTION.match(line)
-    if found is None:
+def _parse_instruction(line: str) -> Instruction | None:
+    """Parse a line of a computation; None if it is not an instruction."""
+    match = _INSTRUCTION.match(line)
+    if match is None:
         return None
-    root, name, shape, operation, rest = found.groups()
-    operands = () if operation == "constant" else tuple(_names(rest.split(")", 1)[0]))
+    root, name, shape, operation, rest = match.groups()
+    operands = () if operation == "constant" else tuple(_find_names(rest.split(")", 1)[0]))
     return Instruction(name, shape, operation, operands, rest, root is not None)
 
 
-def _read(inside: dict[str, Instruction], parameter: Instruction) -> int:
-    """Return the bytes that a fusion reads of a parameter; of a sliced one, what is taken."""
-    whole, taken, seen = _bytes(parameter.shape), 0, [parameter.name]
-    for name in seen:
+def _bytes_read(inside: dict[str, Instruction], parameter: Instruction) -> int:
+    """Count the bytes that a fusion reads of a parameter; only the slices of a sliced one."""
+    whole, taken, aliases = _count_bytes(parameter.shape), 0, [parameter.name]
+    for name in aliases:
         for user in (j for j in inside.values() if name in j.operands):
             if user.operation == "bitcast":
-                seen.append(user.name)
-            elif user.operation in TAKES_A_PART and user.operands[0] == name:
-                taken += _bytes(user.shape)
+                aliases.append(user.name)
+            elif user.operation in PARTIAL_READS and user.operands[0] == name:
+                taken += _count_bytes(user.shape)
             elif user.operation != "dynamic-update-slice" or user.operands[0] != name:
                 return whole
     return min(taken, whole)
 
 
-def _written(inside: dict[str, Instruction], name: str) -> int:
-    """Return the bytes that a fusion writes for an output; of an updated one, what is put in."""
+def _bytes_written(inside: dict[str, Instruction], name: str) -> int:
+    """Count the bytes that a fusion writes for an output; only the update of an updated one."""
     output = inside[name]
     while output.operation == "bitcast":
         output = inside[output.operands[0]]
     if output.operation == "dynamic-update-slice":
-        return _bytes(inside[output.operands[1]].shape)
-    return _bytes(output.shape)
+        return _count_bytes(inside[output.operands[1]].shape)
+    return _count_bytes(output.shape)
 
 
-def _called(i: Instruction, key: str) -> str:
-    """Return the computation that an instruction calls as its `key`, or an empty name."""
-    found = re.search(rf"\b{key}=%?([\w.\-]+)", i.attributes)
-    return found[1] if found else ""
+def _callee(i: Instruction, key: str) -> str:
+    """Return the name of the computation called as `key`; empty if there is none."""
+    match = re.search(rf"\b{key}=%?([\w.\-]+)", i.attributes)
+    return match[1] if match else ""
 
 
-def _names(text: str) -> list[str]:
+def _find_names(text: str) -> list[str]:
     return re.findall(r"%([\w.\-]+)", text)
 
 
-def _number(key: str, text: str) -> int:
-    found = re.search(rf"\b{key}=(\d+)", text)
-    return int(found[1]) if found else 0
+def _find_id(key: str, text: str) -> int:
+    match = re.search(rf"\b{key}=(\d+)", text)
+    return int(match[1]) if match else 0
 
 
-def _shapes(text: str) -> list[tuple[int, list[int]]]:
-    """Return the bytes of an element and the sizes of each array in a type."""
-    found = [(BYTES[kind], sizes) for kind, sizes in _SHAPE.findall(text) if kind in BYTES]
-    return [(size, [int(n) for n in sizes.split(",") if n]) for size, sizes in found]
+def _parse_shapes(text: str) -> list[tuple[int, list[int]]]:
+    """Parse the bytes per element and the sizes of each array in a type."""
+    arrays = [(BYTES[kind], sizes) for kind, sizes in _SHAPE.findall(text) if kind in BYTES]
+    return [(size, [int(n) for n in sizes.split(",") if n]) for size, sizes in arrays]
 
 
-def _bytes(text: str) -> int:
-    return sum(size * prod(sizes) for size, sizes in _shapes(text))
+def _count_bytes(text: str) -> int:
+    return sum(size * prod(sizes) for size, sizes in _parse_shapes(text))

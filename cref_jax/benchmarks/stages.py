@@ -1,7 +1,7 @@
-"""The stages of an iteration, each alone in a program of its own, for the benchmark.
+"""The stages of a training iteration as separate programs for the benchmark.
 
-Each does `STEPS` control steps' worth of its work for the robots that it is given, in such a way
-that XLA can neither drop the work nor do it once for all steps.
+Each does the work of `STEPS` control steps for the given robots, with a dependency between steps,
+so that XLA can neither eliminate the work nor hoist it out of the loop.
 """
 
 import dataclasses
@@ -16,11 +16,11 @@ from cref_jax.env import environment, footholds
 from cref_jax.env.world import World
 from cref_jax.training import camera_feed, iteration, rollout
 
-STEPS = 24  # control steps of one call, as many as a horizon has
+STEPS = 24  # control steps per call, as in one horizon
 
 
 def step_environment(world: World, robots: rollout.Robots) -> Any:
-    """Step the whole environment under small random actions."""
+    """Step the whole environment with small random actions."""
     joints = robots.env.action.shape[-1]
 
     def step(state: environment.EnvState, key: jax.Array) -> tuple[environment.EnvState, Any]:
@@ -32,7 +32,7 @@ def step_environment(world: World, robots: rollout.Robots) -> Any:
 
 
 def step_physics(world: World, robots: rollout.Robots) -> Any:
-    """Step the physics alone, with its terrain queries."""
+    """Step only the physics, including its terrain queries."""
     target = jnp.asarray(world.physics.robot.nominal_pose)
 
     def one(state: environment.EnvState, body: Any) -> Any:
@@ -46,7 +46,7 @@ def step_physics(world: World, robots: rollout.Robots) -> Any:
 
 
 def query_terrain(world: World, robots: rollout.Robots) -> Any:
-    """Ask for the tangent planes of all spheres, as often as a control step does."""
+    """Query the tangent planes of all spheres once per physics substep."""
 
     def one(state: environment.EnvState, body: Any) -> Any:
         return world.physics.planes(world.lanes.tile(state.level, state.kind, state.variant), body)
@@ -54,27 +54,27 @@ def query_terrain(world: World, robots: rollout.Robots) -> Any:
     def query(body: Any, _: None) -> tuple[Any, None]:
         position, rotation = jax.vmap(one)(robots.env, body)
         moved = 1e-6 * (position.sum(axis=(1, 2)) + rotation.sum(axis=(1, 2)))
-        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # prevents hoisting
 
     count = STEPS * world.config.physics.substeps
     return jax.lax.scan(query, robots.env.body, None, length=count)[0]
 
 
 def render_frames(world: World, robots: rollout.Robots) -> Any:
-    """Render as many images as come in so many control steps."""
+    """Render the depth frames of `STEPS` control steps."""
     c = world.config
-    count = depth.most_frames(STEPS, c.camera, c.physics.control_period)
+    count = depth.max_frames(STEPS, c.camera, c.physics.control_period)
 
     def render(state: environment.EnvState, _: None) -> tuple[environment.EnvState, None]:
         images = camera_feed.render_frames(world, state)
-        moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # or it would be hoisted
+        moved = 1e-9 * images.sum(axis=(1, 2, 3), dtype=jnp.float32)  # prevents hoisting
         return state.replace(camera_pitch=state.camera_pitch + moved), None
 
     return jax.lax.scan(render, robots.env, None, length=count)[0]
 
 
 def find_footholds(world: World, robots: rollout.Robots) -> Any:
-    """Find candidates and measure the distance to them, as each control step does."""
+    """Compute foothold candidates and their distances, as in each control step."""
     c = world.config.foothold
 
     def one(state: environment.EnvState, body: Any) -> Any:
@@ -82,19 +82,19 @@ def find_footholds(world: World, robots: rollout.Robots) -> Any:
         soles = footholds.soles(world.physics.links(body), world.physics.robot)
         near = footholds.distance(state.candidates, soles.centre)
         ahead = footholds.candidates(ground, soles.centre, soles.heading, state.command[0], c)
-        lost = footholds.unsupported(ground, soles, c)
+        lost = footholds.count_unsupported(ground, soles, c)
         return near.sum() + ahead.z.sum() + ahead.accepted.sum() + lost.sum()
 
     def find(body: Any, _: None) -> tuple[Any, None]:
-        found = jax.vmap(one)(robots.env, body)
-        moved = 1e-9 * jnp.where(jnp.isfinite(found), found, 0.0)
-        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # or it would be hoisted
+        sums = jax.vmap(one)(robots.env, body)
+        moved = 1e-9 * jnp.where(jnp.isfinite(sums), sums, 0.0)
+        return body._replace(qpos=body.qpos.at[:, 0].add(moved)), None  # prevents hoisting
 
     return jax.lax.scan(find, robots.env.body, None, length=STEPS)[0]
 
 
 def run_policy(world: World, state: iteration.RunState) -> Any:
-    """Run the policy alone; it encodes a frame as often as one comes."""
+    """Run only the policy, which encodes frames at the camera rate."""
     c = world.config
     nets = rollout.networks(c.network, state.robots.env.action.shape[-1])
 
@@ -108,7 +108,7 @@ def run_policy(world: World, state: iteration.RunState) -> Any:
 
 
 def update(world: World, state: iteration.RunState) -> Any:
-    """Run one epoch of the update on a rollout of zeros with the right shapes."""
+    """Run one update epoch on a rollout of zeros with the right shapes."""
     c = world.config
     c = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, horizon=STEPS))
     nets = rollout.networks(c.network, state.robots.env.action.shape[-1])

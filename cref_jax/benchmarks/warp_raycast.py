@@ -1,7 +1,7 @@
-"""What others make of the same work: ray-casts of the scene that our camera sees, and the physics.
+"""Peers for the depth camera and the physics: NVIDIA Warp, mj_multiRay and MuJoCo's batch.
 
 NVIDIA Warp is a dependency of the benchmark alone: `pip install 'cref-jax[bench]'`. On a CPU its
-kernels run on one thread, as MuJoCo's ray-cast does.
+kernels run on one thread, as does MuJoCo's ray-cast.
 """
 
 import importlib.util
@@ -24,22 +24,22 @@ from cref_jax.terrain import Terrain
 from cref_jax.whole_body.ground import Lane
 
 CAMERAS = 256
-RAY_CAST = 16  # of the cameras, by MuJoCo's ray-cast, which is slow
+RAY_CAST = 16  # cameras for MuJoCo's ray-cast, which is slow
 REPEATS = 8
-HEIGHT = (1.0, 1.3)  # m, of the cameras over the ground
-TURN = 0.2  # rad, +-, yaw, pitch and roll about the mount's pose
-TILE = 50  # columns, side of the largest box of the mesh of boxes
+HEIGHT = (1.0, 1.3)  # m, of the cameras above the ground
+TURN = 0.2  # rad, +-, of yaw, pitch and roll about the mounting pose
+TILE = 50  # columns, side of the largest box in the box mesh
 
 
 class Mesh(NamedTuple):
-    """Triangles."""
+    """A triangle mesh."""
 
     points: Float[np.ndarray, "P 3"]  # m
     triangles: Int[np.ndarray, "T 3"]
 
 
 class Speed(NamedTuple):
-    """How quick a renderer is."""
+    """Throughput of a renderer."""
 
     renderer: str
     frames_per_second: float
@@ -47,47 +47,47 @@ class Speed(NamedTuple):
     agreement: float  # share of pixels within 1 cm of the march over the columns
 
 
-def compare(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Speed]:
-    """Return the speed of our renderers, MuJoCo's and, if it is installed, Warp's, on one lane."""
-    position, rotation = _poses(ground, camera)
-    seconds, reference = _ours(ground, position, rotation, camera, is_profile=False)
-    found = [_speed("march over the columns", seconds, "all", reference, reference)]
+def compare_renderers(ground: Terrain, camera: config.Camera, is_profile: bool) -> list[Speed]:
+    """Time our renderers, MuJoCo's and, if installed, Warp's on one lane."""
+    position, rotation = _sample_poses(ground, camera)
+    seconds, reference = _time_own_renderer(ground, position, rotation, camera, is_profile=False)
+    speeds = [_to_speed("march over the columns", seconds, "all", reference, reference)]
     if is_profile:
-        seconds, images = _ours(ground, position, rotation, camera, is_profile=True)
-        found.append(_speed("sweep of the profile", seconds, "all", images, reference))
+        seconds, images = _time_own_renderer(ground, position, rotation, camera, is_profile=True)
+        speeds.append(_to_speed("sweep of the profile", seconds, "all", images, reference))
     heights, origin = robot_scene.window(ground)
     some = slice(0, RAY_CAST)
     lane = Lane(heights, origin, ground.cell, np.inf)
-    seconds, images = _multi_ray(lane, position[some], rotation[some], camera)
-    found.append(_speed("mj_multiRay", seconds, "1", images, reference[some]))
+    seconds, images = _time_multi_ray(lane, position[some], rotation[some], camera)
+    speeds.append(_to_speed("mj_multiRay", seconds, "1", images, reference[some]))
     if importlib.util.find_spec("warp") is None:
-        return found
+        return speeds
     meshes = {
         "boxes": box_mesh(heights, origin, ground.cell),
         "grid": grid_mesh(heights, origin, ground.cell),
     }
     for name, mesh in meshes.items():
-        seconds, images = _warp(mesh, position, rotation, camera)
+        seconds, images = _time_warp(mesh, position, rotation, camera)
         title = f"NVIDIA Warp, {len(mesh.triangles):,} triangles ({name})"
-        found.append(_speed(title, seconds, "1", images, reference))
-    return found
+        speeds.append(_to_speed(title, seconds, "1", images, reference))
+    return speeds
 
 
-def shortest(call: Callable[[], object], repeats: int) -> float:
-    """Return the shortest time of several calls, s; one before them warms up."""
+def shortest_time(call: Callable[[], object], repeats: int) -> float:
+    """Measure the shortest time of `repeats` calls after one warm-up call, s."""
     times = []
     for _ in range(repeats + 1):
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         call()
-        times.append(time.perf_counter() - begun)
+        times.append(time.perf_counter() - started_at)
     return min(times[1:])
 
 
 def box_mesh(
     heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
 ) -> Mesh:
-    """Return a box for each rectangle of columns of one height: vertical risers, few triangles."""
-    boxes = geoms.boxes(heights, TILE, most=heights.size)
+    """Build a mesh of one box per rectangle of equally high columns, with vertical risers."""
+    boxes = geoms.merge_boxes(heights, TILE, most=heights.size)
     assert boxes is not None
     low = float(heights.min()) - robot_scene.BASE
     sides = np.array(
@@ -105,7 +105,7 @@ def box_mesh(
 def grid_mesh(
     heights: Float[np.ndarray, "X Y"], origin: Float[np.ndarray, "2"], cell: float
 ) -> Mesh:
-    """Return two triangles between the middles of four columns, as of a height field."""
+    """Build a mesh with two triangles between four column centres, as in a height field."""
     x, y = (origin[k] + (np.arange(n) + 0.5) * cell for k, n in enumerate(heights.shape))
     points = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1).reshape(-1, 3)
     across = heights.shape[1]
@@ -115,10 +115,10 @@ def grid_mesh(
     return Mesh(points.astype(np.float32), np.concatenate([lower, upper]))
 
 
-def _poses(
+def _sample_poses(
     ground: Terrain, camera: config.Camera
 ) -> tuple[Float[np.ndarray, "E 3"], Float[np.ndarray, "E 3 3"]]:
-    """Return cameras all along the lane that look as they do on the robot, and a little askew."""
+    """Sample camera poses along the lane: the mounting pose with small random rotations."""
     rng = np.random.default_rng(0)
     heights, origin = robot_scene.window(ground)
     x = origin[0] + rng.uniform(0.05, 0.75, CAMERAS) * heights.shape[0] * ground.cell
@@ -134,14 +134,14 @@ def _poses(
     return position.T.astype(np.float32), rotation.astype(np.float32)
 
 
-def _ours(
+def _time_own_renderer(
     ground: Terrain,
     position: Float[np.ndarray, "E 3"],
     rotation: Float[np.ndarray, "E 3 3"],
     camera: config.Camera,
     is_profile: bool,
 ) -> tuple[float, Float[np.ndarray, "E H W"]]:
-    """Return the time of all images, s, and the images; no capsules, which Warp does not have."""
+    """Time our renderer: seconds for all images, and the images, without the robot's capsules."""
 
     def draw(
         ground: Terrain, position: Float[Array, "3"], rotation: Float[Array, "3 3"]
@@ -150,13 +150,15 @@ def _ours(
 
     program = jax.jit(jax.vmap(draw, in_axes=(None, 0, 0)))
     draw_all = lambda: jax.block_until_ready(program(ground, position, rotation))
-    return shortest(draw_all, REPEATS), np.asarray(draw_all())
+    return shortest_time(draw_all, REPEATS), np.asarray(draw_all())
 
 
-def raw_substep(physics: Physics, bodies: Body, threads: int, steps: int, repeats: int) -> float:
-    """Return the time of a substep of all robots in MuJoCo's own batch, s.
+def time_raw_substep(
+    physics: Physics, bodies: Body, threads: int, steps: int, repeats: int
+) -> float:
+    """Measure the time of one substep of all robots in MuJoCo's own batch, s.
 
-    They stand on level planes: without a terrain, without copies, and without JAX.
+    The robots stand on level planes, without terrain queries, copies or JAX.
     """
     count = len(bodies.qpos)
     batch, model = Batch(physics.model, count, threads), physics.model
@@ -168,59 +170,59 @@ def raw_substep(physics: Physics, bodies: Body, threads: int, steps: int, repeat
         for view, value in zip(views.values(), (*bodies, targets), strict=True):
             view[:] = value
         planes[:, : model.nmocap] = 0.0
-        begun = time.perf_counter()
+        started_at = time.perf_counter()
         for _ in range(steps):
             batch.step()
-        best = min(best, (time.perf_counter() - begun) / steps)
+        best = min(best, (time.perf_counter() - started_at) / steps)
     return best
 
 
-def _multi_ray(
+def _time_multi_ray(
     lane: Lane,
     position: Float[np.ndarray, "E 3"],
     rotation: Float[np.ndarray, "E 3 3"],
     camera: config.Camera,
 ) -> tuple[float, Float[np.ndarray, "E H W"]]:
-    """Return the time of all images, s, and the images."""
+    """Time mj_multiRay: seconds for all images, and the images."""
     spec = mujoco.MjSpec()
     lane.add_to(spec, robot.FRICTION)
     model = spec.compile()
     state = mujoco.MjData(model)
     mujoco.mj_forward(model, state)
-    rays = _rays(camera)
-    long = np.linalg.norm(rays, axis=1)
-    unit, count = rays / long[:, None], len(rays)
+    rays = _pixel_rays(camera)
+    length = np.linalg.norm(rays, axis=1)
+    unit, count = rays / length[:, None], len(rays)
     images = np.empty((len(position), count))
 
     def cast() -> None:
-        found, distance = np.zeros(count, np.int32), np.zeros(count)
+        hit, distance = np.zeros(count, np.int32), np.zeros(count)
         for k in range(len(position)):
             world = (unit @ rotation[k].T.astype(float)).ravel()
             mujoco.mj_multiRay(
-                model, state, position[k].astype(float), world, None, True, -1, found, distance,
+                model, state, position[k].astype(float), world, None, True, -1, hit, distance,
                 None, count, 1e3,
             )  # fmt: skip
-            images[k] = np.where(distance < 0.0, np.inf, distance / long)
+            images[k] = np.where(distance < 0.0, np.inf, distance / length)
 
-    seconds = shortest(cast, 1)
+    seconds = shortest_time(cast, 1)
     return seconds, np.minimum(images, camera.d_max).reshape(-1, *camera.shape)
 
 
-def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
-    """Return the directions (x, y, 1) of the pixels, row by row."""
+def _pixel_rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
+    """Compute the directions (x, y, 1) of the pixels in row-major order."""
     (h, w), (vertical, horizontal) = camera.shape, camera.view
     tangent = lambda n, view: (2 * (np.arange(n) + 0.5) / n - 1) * np.tan(np.radians(view / 2))
     x, y = np.meshgrid(tangent(w, horizontal), tangent(h, vertical))
     return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
 
 
-def _warp(
+def _time_warp(
     mesh: Mesh,
     position: Float[np.ndarray, "E 3"],
     rotation: Float[np.ndarray, "E 3 3"],
     camera: config.Camera,
 ) -> tuple[float, Float[np.ndarray, "E H W"]]:
-    """Return the time of all images, s, and the images."""
+    """Time NVIDIA Warp: seconds for all images, and the images."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.config.quiet = True
@@ -238,7 +240,7 @@ def _warp(
         hit = wp.mesh_query_ray(mesh, position[e], rotation[e] * rays[k], farthest)
         image[e, k] = wp.where(hit.result, hit.t, farthest)
 
-    rays, (h, w) = _rays(camera), camera.shape
+    rays, (h, w) = _pixel_rays(camera), camera.shape
     array = lambda values, dtype: wp.array(values, dtype=dtype, device="cpu")
     solid = wp.Mesh(array(mesh.points, wp.vec3), array(mesh.triangles.ravel(), wp.int32))
     image = wp.zeros((len(position), h * w), dtype=float, device="cpu")
@@ -246,10 +248,10 @@ def _warp(
     launch = lambda: wp.launch(
         cast, image.shape, inputs=[solid.id, *inputs, camera.d_max, image], device="cpu"
     )
-    return shortest(launch, REPEATS), image.numpy().reshape(-1, h, w).copy()
+    return shortest_time(launch, REPEATS), image.numpy().reshape(-1, h, w).copy()
 
 
-def _speed(
+def _to_speed(
     name: str,
     seconds: float,
     threads: str,

@@ -1,7 +1,7 @@
 """Every number of the program, and how a run changes them."""
 
 from cref_jax.config.learning import PPO, Network, Run, Variant
-from cref_jax.config.overrides import load_toml, override, unknown
+from cref_jax.config.overrides import describe_unknown, load_toml, override
 from cref_jax.config.settings import Config
 from cref_jax.config.simulation import Camera, Foothold, Physics, Robot, Scan, Terrain
 from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Reward, RewardWeights
@@ -26,7 +26,7 @@ __all__ = [
     "Scan",
     "Terrain",
     "Variant",
+    "describe_unknown",
     "load_toml",
     "override",
-    "unknown",
 ]

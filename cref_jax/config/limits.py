@@ -1,11 +1,11 @@
-"""Which settings can run: what is wrong is said before anything is compiled."""
+"""Checks of the settings, made before anything is compiled."""
 
 from cref_jax.config.settings import Config
 from cref_jax.errors import ConfigError
 
 
 def check(c: Config) -> None:
-    """Refuse settings that could not run, before anything is compiled.
+    """Refuse settings that cannot run.
 
     Raises:
         ConfigError: says which setting, and what would be right.

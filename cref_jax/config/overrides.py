@@ -14,7 +14,7 @@ C = TypeVar("C")
 
 
 def override(config: C, changes: dict[str, Any], where: str = "") -> C:
-    """Return `config` with the nested `changes` applied.
+    """Apply nested `changes` to `config`.
 
     Raises:
         ConfigError: a key that does not exist (the nearest one is named), or a bad value.
@@ -24,18 +24,18 @@ def override(config: C, changes: dict[str, Any], where: str = "") -> C:
     for key, value in changes.items():
         path = f"{where}{key}"
         if key not in hints:
-            raise ConfigError(unknown("setting", key, list(hints), where))
+            raise ConfigError(describe_unknown("setting", key, list(hints), where))
         if dataclasses.is_dataclass(hints[key]):
             if not isinstance(value, dict):
                 raise ConfigError(f"'{path}' is a table of settings, not {value!r}")
             values[key] = override(getattr(config, key), value, where=f"{path}.")
         else:
-            values[key] = _checked(value, hints[key], path)
+            values[key] = _check_value(value, hints[key], path)
     return dataclasses.replace(config, **values)  # type: ignore[type-var]
 
 
-def unknown(what: str, name: str, known: list[str], where: str = "") -> str:
-    """Return the message for a name that does not exist: the nearest one, or all that do.
+def describe_unknown(what: str, name: str, known: list[str], where: str = "") -> str:
+    """Build the message for an unknown name: the nearest one, or all that exist.
 
     `where` is what stands before the name, such as the tables that a setting is in.
     """
@@ -45,7 +45,7 @@ def unknown(what: str, name: str, known: list[str], where: str = "") -> str:
 
 
 def load_toml(path: Path) -> dict[str, Any]:
-    """Return the tables of a TOML file.
+    """Read the tables of a TOML file.
 
     Raises:
         ConfigError: the file is missing or is not TOML.
@@ -58,12 +58,12 @@ def load_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _checked(value: Any, hint: Any, path: str) -> Any:
-    """Return `value` as the type that the field declares, or say what would be right."""
+def _check_value(value: Any, hint: Any, path: str) -> Any:
+    """Convert `value` to the field's declared type, or say what would be right."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         inner = next(arg for arg in args if arg is not type(None))
-        return None if value is None else _checked(value, inner, path)
+        return None if value is None else _check_value(value, inner, path)
     if origin is Literal:
         if value not in args:
             raise ConfigError(
@@ -76,7 +76,7 @@ def _checked(value: Any, hint: Any, path: str) -> Any:
         kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
         if len(kinds) != len(value):
             raise ConfigError(f"'{path}' takes {len(kinds)} values, not {len(value)}")
-        return tuple(_checked(v, k, path) for v, k in zip(value, kinds, strict=True))
+        return tuple(_check_value(v, k, path) for v, k in zip(value, kinds, strict=True))
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not hint:

@@ -9,7 +9,7 @@ from cref_jax.errors import ConfigError
 
 
 def build_config(terrain: str, experiment: str | None, device: str) -> Config:
-    """Return the settings of a new run: the paper's, changed by the device and the experiment.
+    """Build the settings of a new run: the paper's, changed by device and experiment.
 
     Raises:
         ConfigError: an unknown experiment, or a file that cannot be used.
@@ -32,5 +32,5 @@ def _experiment_file(name: str) -> Path:
     folder = folders.data_folder("experiments")
     known = sorted(p.stem for p in folder.glob("*.toml") if p.stem != "presets")
     if name not in (*known, "presets"):
-        raise ConfigError(overrides.unknown("experiment", name, known))
+        raise ConfigError(overrides.describe_unknown("experiment", name, known))
     return folder / f"{name}.toml"

@@ -14,7 +14,7 @@ from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Re
 
 @dataclass(frozen=True)
 class Config:
-    """One run, whole."""
+    """All settings of a run."""
 
     run: Run = field(default_factory=Run)
     robot: Robot = field(default_factory=Robot)

@@ -70,7 +70,7 @@ class Reward:
 
 @dataclass(frozen=True)
 class Command:
-    """What the robot is asked to do. Ranges are uniform."""
+    """Velocity commands. Ranges are uniform."""
 
     vx: tuple[float, float] = (0.0, 1.0)  # m/s; assumed: covers the 0.4-0.8 of Sec. III-A
     vy: tuple[float, float] = (-0.3, 0.3)  # m/s; assumed
@@ -139,7 +139,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Curriculum:
-    """Which level of its terrain a robot meets next. assumed: legged_gym's rule."""
+    """The level of the next episode. assumed: legged_gym's rule."""
 
     enabled: bool = True
     up: float = 0.5  # of the lane walked: one level harder

@@ -1,4 +1,4 @@
-"""The depth camera: where it is, when its frames come, and how they are normalised."""
+"""The depth camera: its pose, the timing of its frames, and their normalisation."""
 
 import functools
 import math
@@ -12,10 +12,10 @@ from cref_jax import config, geometry, robot
 from cref_jax.robot.kinematics import Links
 
 
-def nearest_around(depth: Float[Array, "H W"], window: int) -> Float[Array, "H W"]:
-    """Return the nearest depth of the `window` x `window` pixels around each, at the rims of fewer.
+def min_filter(depth: Float[Array, "H W"], window: int) -> Float[Array, "H W"]:
+    """Compute the minimum depth over the `window` x `window` pixels around each; fewer at the rims.
 
-    A stereo camera matches squares: what stands before a hole smaller than one covers it.
+    A stereo camera matches squares: anything in front of a hole smaller than one square hides it.
     """
     for axis, size in enumerate(depth.shape):
         reach = window // 2
@@ -29,8 +29,8 @@ def nearest_around(depth: Float[Array, "H W"], window: int) -> Float[Array, "H W
     return depth
 
 
-def normalise(depth: Float[Array, "*n H W"], camera: config.Camera) -> Float[Array, "*n H W"]:
-    """Return D / d_max - 0.5, the image that the network sees, in [-0.5, 0.5]."""
+def normalize(depth: Float[Array, "*n H W"], camera: config.Camera) -> Float[Array, "*n H W"]:
+    """Compute D / d_max - 0.5, the network's input image, in [-0.5, 0.5]."""
     return depth / camera.d_max - 0.5
 
 
@@ -41,10 +41,10 @@ def pose(
     pitch_error: Float[ArrayLike, ""],
     position_error: Float[ArrayLike, "3"],
 ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return position, m, and axes of the camera in the world, as `render` takes them.
+    """Compute the camera's position, m, and axes in the world, the inputs of `render`.
 
-    The optical axis looks camera.pitch below the mount's x axis, and `pitch_error`, rad, further
-    down. The camera sits `position_error`, m along the mount's axes, from its place.
+    The optical axis points camera.pitch, deg, below the mount's x axis, and `pitch_error`, rad,
+    further down. `position_error`, m, shifts the camera along the mount's axes.
     """
     pitch = math.radians(camera.pitch) + pitch_error
     c, s = jnp.cos(pitch), jnp.sin(pitch)
@@ -58,27 +58,27 @@ def pose(
 def is_due(
     step: Int[ArrayLike, "*n"], camera: config.Camera, control_period: float
 ) -> Bool[Array, "*n"]:
-    """Return whether a frame arrives at this control step: 20 Hz at 50 Hz is 3, 2, 3, 2 steps.
+    """Check whether a frame arrives at this control step; 20 Hz at 50 Hz: every 3, 2, 3, 2 steps.
 
-    Whether floor(step * rate * period) differs from that of the step before, in whole numbers.
+    True where floor(step * rate * period) increases, in integer arithmetic.
     """
-    frames, steps = _frames(camera, control_period)
+    frames, steps = _frame_ratio(camera, control_period)
     return (jnp.asarray(step) % steps) * frames % steps < frames
 
 
-def most_frames(steps: int, camera: config.Camera, control_period: float) -> int:
-    """Return the largest number of frames that arrive in any `steps` successive control steps."""
-    frames, period = _frames(camera, control_period)
+def max_frames(steps: int, camera: config.Camera, control_period: float) -> int:
+    """Compute the maximum number of frames in any `steps` successive control steps."""
+    frames, period = _frame_ratio(camera, control_period)
     return -(-steps * frames // period)
 
 
 def longest_hold(camera: config.Camera, control_period: float) -> int:
-    """Return the largest number of control steps from one frame to the next."""
-    frames, steps = _frames(camera, control_period)
+    """Compute the maximum number of control steps from one frame to the next."""
+    frames, steps = _frame_ratio(camera, control_period)
     return -(-steps // frames)
 
 
-def _frames(camera: config.Camera, control_period: float) -> tuple[int, int]:
-    """Return how many frames arrive in how many control steps; never more than one a step."""
+def _frame_ratio(camera: config.Camera, control_period: float) -> tuple[int, int]:
+    """Compute (frames, steps), the ratio of frames to control steps; at most one frame per step."""
     ratio = min(Fraction(camera.rate * control_period).limit_denominator(10_000), Fraction(1))
     return ratio.numerator, ratio.denominator

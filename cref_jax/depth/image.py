@@ -1,7 +1,7 @@
-"""The depth image of the ground and of the robot's own links.
+"""Depth images of the ground and the robot's own links.
 
-It holds distances along the optical axis, as a RealSense reports them (Sec. II-D). Frames: the
-camera's x right, y down, z forward; pixel (0, 0) is at the top left.
+Depth is measured along the optical axis, as by a RealSense (Sec. II-D). Frames: the camera's x
+right, y down, z forward; pixel (0, 0) is at the top left.
 """
 
 import math
@@ -17,7 +17,7 @@ from cref_jax.robot import kinematics
 from cref_jax.robot.kinematics import Links
 from cref_jax.terrain import Terrain
 
-_PARALLEL = 1e-9  # no ray is more nearly parallel to a capsule: sine squared of their angle
+_PARALLEL = 1e-9  # lower bound of the sine squared of the angle between a ray and a capsule
 
 
 def render(
@@ -28,50 +28,53 @@ def render(
     camera: config.Camera,
     is_profile: bool = False,
 ) -> Float[Array, "H W"]:
-    """Return the depth image of one camera, m.
+    """Render the depth image of one camera, m.
 
     The columns of `rotation` are the camera's axes in the world; a capsule is two ends and a
-    radius, in the world. What is further than d_max, or nowhere, reads d_max. A camera in the
-    ground reads 0; a capsule that the camera is inside of is not seen.
+    radius, m, in the world. Rays that hit nothing within d_max read d_max. A camera inside the
+    ground reads 0; a capsule around the camera is invisible.
 
-    `is_profile` promises that heights are the same all across (along y), as on stairs: the image is
-    the same, and comes sooner.
+    `is_profile` promises that heights are constant across the lane (along y), as on stairs: the
+    image is the same, but faster to render.
     """
     height, width = camera.shape
-    x, y = _slopes(width, camera.view[1])[None, :], _slopes(height, camera.view[0])[:, None]
+    x, y = (
+        _pixel_slopes(width, camera.view[1])[None, :],
+        _pixel_slopes(height, camera.view[0])[:, None],
+    )
     if is_profile:
         ground = sweep.profile_depth(terrain, position, rotation, x, y, camera)
     else:
         ground = raymarch.ground_depth(terrain, position, rotation, x, y, camera)
-    links = _links(position, rotation, capsules, x, y)
+    links = _render_links(position, rotation, capsules, x, y)
     return jnp.minimum(jnp.minimum(ground, links), camera.d_max)
 
 
 def capsules_in_view(links: Links, capsules: robot.Capsules) -> Float[Array, "C 7"]:
-    """Return the capsules that may stand before the camera: both ends and radius, m, world."""
-    seen = np.flatnonzero(capsules.in_view)
+    """Compute both ends and the radius of each capsule that the camera may see, m, world."""
+    visible = np.flatnonzero(capsules.in_view)
     start, end = (
-        kinematics.points(links, capsules.body[seen], ends[seen])
+        kinematics.points(links, capsules.body[visible], ends[visible])
         for ends in (capsules.start, capsules.end)
     )
-    return jnp.concatenate([start, end, jnp.asarray(capsules.radius)[seen, None]], axis=1)
+    return jnp.concatenate([start, end, jnp.asarray(capsules.radius)[visible, None]], axis=1)
 
 
-def _slopes(pixels: int, view: float) -> Float[np.ndarray, " n"]:
-    """Return the tangents of the pixels' angles from the optical axis, `view` in deg."""
+def _pixel_slopes(pixels: int, view: float) -> Float[np.ndarray, " n"]:
+    """Compute the tangents of the pixels' angles from the optical axis; `view` in deg."""
     middles = 2.0 * (np.arange(pixels) + 0.5) / pixels - 1.0
     return (middles * math.tan(math.radians(0.5 * view))).astype(np.float32)
 
 
-def _links(
+def _render_links(
     position: Float[Array, "3"],
     rotation: Float[Array, "3 3"],
     capsules: Float[Array, "C 7"],
     x: Float[np.ndarray, "1 W"],
     y: Float[np.ndarray, "H 1"],
 ) -> Float[Array, "H W"]:
-    """Return the depth of the nearest capsule along each ray d = (x, y, 1), m, or infinity."""
-    # highest: a GPU would round the factors to 10 bits
+    """Render the depth of the nearest capsule along each ray d = (x, y, 1), m, or infinity."""
+    # highest precision: a GPU would otherwise round the factors to 10 bits
     turn = lambda v: jnp.matmul(v, rotation, precision=jax.lax.Precision.HIGHEST)
     start = turn(capsules[:, :3] - position)  # m, in the camera's frame
     axis = turn(capsules[:, 3:6] - capsules[:, :3])
@@ -79,12 +82,12 @@ def _links(
     axis = axis / jnp.maximum(length, geometry.SMALL)[:, None]
     nearest = jnp.full((y.size, x.size), jnp.inf)
     for c in range(capsules.shape[0]):
-        hit = _capsule(start[c], axis[c], length[c], capsules[c, 6], x, y)
+        hit = _intersect_capsule(start[c], axis[c], length[c], capsules[c, 6], x, y)
         nearest = jnp.minimum(nearest, hit)
     return nearest
 
 
-def _capsule(
+def _intersect_capsule(
     start: Float[Array, "3"],
     axis: Float[Array, "3"],
     length: Float[Array, ""],
@@ -92,10 +95,10 @@ def _capsule(
     x: Float[np.ndarray, "1 W"],
     y: Float[np.ndarray, "H 1"],
 ) -> Float[Array, "H W"]:
-    """Return where rays from the origin meet a capsule first, m of depth, or infinity.
+    """Compute the depth at which rays from the origin enter a capsule, m, or infinity.
 
-    A ray enters the endless cylinder at t, from |t d - start|^2 - (axis . (t d - start))^2 = r^2.
-    The sphere inside of the capsule there, or at the nearer end, is where it enters the capsule.
+    A ray enters the infinite cylinder at t, from |t d - start|^2 - (axis . (t d - start))^2 = r^2.
+    It enters the capsule where it enters the sphere centred there, or at the nearer end.
     """
     d_d = x * x + y * y + 1.0
     d_axis = x * axis[0] + y * axis[1] + axis[2]
@@ -106,7 +109,7 @@ def _capsule(
     a = jnp.maximum(d_d - d_axis * d_axis, _PARALLEL)
     b = d_start - along * d_axis
     t = (b - jnp.sqrt(jnp.maximum(b * b - a * (square - along * along), 0.0))) / a
-    at = jnp.clip(t * d_axis - along, 0.0, length)  # m along the axis, the sphere's centre
+    at = jnp.clip(t * d_axis - along, 0.0, length)  # m along the axis, centre of the sphere
 
     d_centre = d_start + at * d_axis
     rest = d_centre * d_centre - d_d * (square + at * (2.0 * along + at))

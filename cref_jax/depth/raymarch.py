@@ -1,8 +1,8 @@
-"""Rays that walk over columns of any heights, for lanes that are not level across.
+"""Ray marching over columns of arbitrary heights, for lanes that are not level across.
 
-Every ray starts where it comes down to the highest column within the camera's reach. Low relief it
-then walks through column by column, which is a few of them. Over higher relief it first leaps from
-block to block. All walks have one state, the depth reached; its sign bit says that it has ended.
+Every ray starts where it descends to the highest column within the camera's reach. Through low
+relief it then walks column by column, which takes few steps. Over higher relief it first leaps from
+block to block. The only state of a walk is the depth reached; its sign bit marks the end.
 """
 
 import math
@@ -16,33 +16,32 @@ from jaxtyping import Array, Bool, Float, Int
 from cref_jax import config
 from cref_jax.terrain import BLOCKS, Terrain, block_bottom, block_top
 
-_ALONG = 1e-6  # columns/m, no ray is more nearly parallel to a border of columns
-_LOW = 8.0  # columns of height: lower relief is walked through; 8 to 20 borders at 40 to 20 degrees
-_ROUNDER = np.float32(
-    1.5 * 2**23
-)  # a float plus this is whole, and its lowest bits are the integer
+_ALONG = 1e-6  # columns/m, minimum slope of a ray against the borders of columns
+_LOW = 8.0  # columns of height; lower relief is walked, 8 to 20 borders at 40 to 20 degrees
+# a float plus this is whole, and its lowest bits are the integer
+_ROUNDER = np.float32(1.5 * 2**23)
 _ROUNDER_BITS = int(_ROUNDER.view(np.int32))
 _COLUMN, _SMALL, _MIDDLE, _LARGE = range(len(BLOCKS))
 
 
 class _Eye(NamedTuple):
-    """Where a camera is on the grid. Scalars: XLA then makes one loop over all rays of all cameras.
+    """A camera on the grid, as scalars: XLA then compiles one loop over all rays of all cameras.
 
-    Columns are counted from the corner of the largest block that the camera stands on: numbers
-    stay small, so float32 stays exact, and blocks begin at multiples of their side.
+    Columns are counted from the corner of the camera's largest block: numbers stay small, so
+    float32 stays exact, and blocks begin at multiples of their side.
     """
 
-    i: Int[Array, ""]  # column of the window in that corner
+    i: Int[Array, ""]  # column of the window at that corner
     j: Int[Array, ""]
     x: Float[Array, ""]  # columns
     y: Float[Array, ""]
     z: Float[Array, ""]  # m
-    axes: Float[Array, "3 3"]  # columns/m, columns/m, 1: the world's x, y, z of the camera's axes
-    nudge: float  # columns, further along the ray is the column that a point on a border belongs to
+    axes: Float[Array, "3 3"]  # columns/m, columns/m, 1: world x, y, z of the camera's axes
+    nudge: float  # columns along the ray, from a point on a border into the column it belongs to
 
 
 class _Rays(NamedTuple):
-    """All rays of a camera and what they meet."""
+    """All rays of a camera and the ground they march over."""
 
     ground: Terrain
     eye: _Eye
@@ -54,14 +53,14 @@ class _Rays(NamedTuple):
 
 
 class _Ray(NamedTuple):
-    """Directions, for one unit of depth, and the inverses that divide by them."""
+    """Ray directions per unit of depth, and their inverses."""
 
     x: Float[Array, "H W"]  # columns/m
     y: Float[Array, "H W"]
     z: Float[Array, "H W"]  # m/m
     per_x: Float[Array, "H W"]  # m/column
     per_y: Float[Array, "H W"]
-    per_z: Float[Array, "H W"]  # m/m; 0 for a ray that does not go down
+    per_z: Float[Array, "H W"]  # m/m; 0 for a ray that does not descend
 
 
 def ground_depth(
@@ -72,20 +71,20 @@ def ground_depth(
     y: Float[np.ndarray, "H 1"],
     camera: config.Camera,
 ) -> Float[Array, "H W"]:
-    """Return the depth of the ground along each ray d = (x, y, 1), m, or d_max where there is none.
+    """Render the depth of the ground along each ray d = (x, y, 1), m; d_max where it hits none.
 
     The columns of `rotation` are the camera's axes in the world.
     """
     reach = ray_reach(ground, camera)
-    eye = _eye(ground, position, rotation, reach)
-    bottom, top = _relief(ground, eye, reach)
+    eye = _to_columns(ground, position, rotation, reach)
+    bottom, top = _find_relief(ground, eye, reach)
     is_high = top - bottom > _LOW * ground.cell
-    to_x, to_y = (_apart_from_zero(row[0] * x + row[1] * y + row[2]) for row in eye.axes[:2])
+    to_x, to_y = (_avoid_zero(row[0] * x + row[1] * y + row[2]) for row in eye.axes[:2])
 
     def walk(
         depth: Float[Array, "H W"], levels: tuple[int, ...], is_on: Bool[Array, ""]
     ) -> Float[Array, "H W"]:
-        """Walk on over blocks of these levels in turn, if this camera does."""
+        """Continue the walks over blocks of these levels in turn, if `is_on`."""
         return _walk(_Rays(ground, eye, to_x, to_y, x, y, camera), levels, depth, is_on)
 
     to_z = eye.axes[2, 0] * x + eye.axes[2, 1] * y + eye.axes[2, 2]
@@ -95,20 +94,20 @@ def ground_depth(
     depth = jnp.abs(walk(depth, (_MIDDLE, _MIDDLE), is_high))
     depth = walk(depth, (_COLUMN, _COLUMN), ~is_high)
     depth = walk(depth, (_SMALL, _COLUMN, _COLUMN), is_high)
-    seen = _has_ended(depth) & (-depth < camera.d_max)  # not NaN, either
-    return jnp.where(seen, -depth, camera.d_max)
+    is_hit = _has_ended(depth) & (-depth < camera.d_max)  # False for NaN
+    return jnp.where(is_hit, -depth, camera.d_max)
 
 
 def ray_reach(ground: Terrain, camera: config.Camera) -> float:
-    """Return the number of columns in the longest ray."""
+    """Compute the length of the longest ray in columns."""
     corner = [math.tan(math.radians(0.5 * view)) for view in camera.view]
     return camera.d_max * math.hypot(1.0, *corner) / ground.cell
 
 
-def _eye(
+def _to_columns(
     ground: Terrain, position: Float[Array, "3"], rotation: Float[Array, "3 3"], reach: float
 ) -> _Eye:
-    """Return a camera in columns."""
+    """Convert the camera's pose to columns."""
     place = (position[:2] - ground.origin) * (1.0 / ground.cell)
     column = jnp.floor(place)
     inside = column.astype(jnp.int32) & (BLOCKS[-1] - 1)
@@ -119,8 +118,10 @@ def _eye(
     return _Eye(corner[0], corner[1], x, y, position[2], rotation * scale, nudge)
 
 
-def _relief(ground: Terrain, eye: _Eye, reach: float) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the lowest and the highest column of all large blocks within reach, m."""
+def _find_relief(
+    ground: Terrain, eye: _Eye, reach: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Find the lowest and the highest column of all large blocks within reach, m."""
     side = BLOCKS[_LARGE]
     most = int(reach) // side + 1
     i, j = np.meshgrid(*2 * [side * np.arange(-most, most + 1)])
@@ -128,7 +129,7 @@ def _relief(ground: Terrain, eye: _Eye, reach: float) -> tuple[Float[Array, ""],
     return block_bottom(*around).min(), block_top(*around, _LARGE).max()
 
 
-def _apart_from_zero(slope: Float[Array, "*n"]) -> Float[Array, "*n"]:
+def _avoid_zero(slope: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(jnp.abs(slope) < _ALONG, _ALONG, slope)
 
 
@@ -139,11 +140,11 @@ def _inverse_if_down(to_z: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def _walk(
     rays: _Rays, levels: tuple[int, ...], depth: Float[Array, "H W"], is_on: Bool[Array, ""]
 ) -> Float[Array, "H W"]:
-    """Return the depth after walks to the end: of d_max, or with the sign bit set, of the ground.
+    """Walk each ray to d_max, or to the ground, whose depth gets the sign bit.
 
-    A walk over nothing but large blocks ends at the first one that the ray meets.
+    A walk over large blocks alone ends at the first block that the ray hits.
     """
-    most = int(2 * (ray_reach(rays.ground, rays.camera) + 2))  # two borders a column
+    most = int(2 * (ray_reach(rays.ground, rays.camera) + 2))  # two borders per column
     ends_at = min(levels)
 
     def is_short(carry: tuple) -> Bool[Array, ""]:
@@ -153,17 +154,17 @@ def _walk(
     def advance(carry: tuple) -> tuple:
         count, axes, one, _, depth = carry
         for k in range(2):  # into a second array and back: with one, XLA would copy it
-            # of the depth before and not after the steps: XLA would make them once more for this
+            # from the depth before the steps: from that after them, XLA would compute them twice
             is_walking = jnp.any(_is_walking(depth, rays.camera), axis=1) & is_on
             ray = _ray(rays, axes, one)
             further = depth
             for level in levels:
                 further = _step(rays, ray, further, level, level == ends_at)
-            # a row that has ended is a branch around all of the above
+            # for a row that has ended, a branch skips all of the above
             depth = jnp.where(is_walking[:, None], further, depth)
             if k == 0:
                 depth = jax.lax.optimization_barrier(depth)
-        # as if they changed: or XLA would store all inverses, and reading them takes longer
+        # as if they changed: else XLA would store all inverses, and reading them is slower
         axes, one = (jnp.where(count < most, v, 0.0) for v in (axes, one))
         return count + 1, axes, one, is_walking, depth
 
@@ -173,7 +174,7 @@ def _walk(
 
 
 def _ray(rays: _Rays, axes: Float[Array, "3 3"], one: Float[Array, ""]) -> _Ray:
-    """Return the rays; `axes` are those of the eye, `one` is 1."""
+    """Compute directions and inverses; `axes` are those of the eye, `one` is 1."""
     to_x, to_y = rays.to_x, rays.to_y
     to_z = axes[2, 0] * rays.x + axes[2, 1] * rays.y + axes[2, 2]
     inverse = one / (to_x * to_y)  # one division for two
@@ -183,15 +184,15 @@ def _ray(rays: _Rays, axes: Float[Array, "3 3"], one: Float[Array, ""]) -> _Ray:
 def _step(
     rays: _Rays, ray: _Ray, depth: Float[Array, "H W"], level: int, is_end: bool
 ) -> Float[Array, "H W"]:
-    """Return the depth where each ray leaves its block of BLOCKS[level], or comes upon its top.
+    """Compute the depth at which each ray leaves its block of BLOCKS[level] or hits the ground.
 
-    If `is_end`, that sets its sign bit; a depth that has it stays. Minima and maxima are choices,
-    which are one instruction; those that keep a NaN are four. So is taking the integer from a
-    rounded float's bits, where a conversion looks for NaN and overflow.
+    If `is_end`, a hit sets the sign bit; a depth with the sign bit set stays. Minima and maxima are
+    selections, one instruction each; those that keep a NaN are four. Likewise, the integer is taken
+    from the bits of a rounded float, because a conversion checks for NaN and overflow.
     """
     ground, eye, side = rays.ground, rays.eye, BLOCKS[level]
     east, north = ray.x > 0.0, ray.y > 0.0
-    # the nearest whole number to half a column less is the one below
+    # rounding half a column less gives the floor
     i = depth * ray.x + (jnp.where(east, eye.x + eye.nudge, eye.x - eye.nudge) - 0.5) + _ROUNDER
     j = depth * ray.y + (jnp.where(north, eye.y + eye.nudge, eye.y - eye.nudge) - 0.5) + _ROUNDER
     i, j = _bits(i), _bits(j)
@@ -204,19 +205,19 @@ def _step(
     lowest = eye.z + ray.z * jnp.where(ray.z < 0.0, out, depth)
 
     on_top = (top - eye.z) * ray.per_z
-    met = jnp.where(on_top > depth, on_top, depth)  # on its top, or on its side
-    further = jnp.where(lowest <= top, -met if is_end else met, out)
+    hit = jnp.where(on_top > depth, on_top, depth)  # on its top, or on its side
+    further = jnp.where(lowest <= top, -hit if is_end else hit, out)
     return jnp.where(_has_ended(depth), depth, further)
 
 
 def _is_walking(depth: Float[Array, "*n"], camera: config.Camera) -> Bool[Array, "*n"]:
-    """Return which depths are between zero and d_max, one comparison of bits; not NaN."""
+    """Check for depths between zero and d_max, by one comparison of bits; False for NaN."""
     most = int(np.float32(camera.d_max).view(np.uint32))
     return _bits(depth).astype(jnp.uint32) < most  # a sign bit makes it large
 
 
 def _has_ended(depth: Float[Array, "*n"]) -> Bool[Array, "*n"]:
-    return _bits(depth) < 0  # -0, too
+    return _bits(depth) < 0  # also true for -0
 
 
 def _bits(x: Float[Array, "*n"]) -> Int[Array, "*n"]:

@@ -1,4 +1,4 @@
-"""Depth of ground that is level across, as stairs are, by one sweep over its columns."""
+"""Depth of ground that is level across, such as stairs, by one sweep over its columns."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from cref_jax import config, terrain
 from cref_jax.depth import raymarch
 from cref_jax.terrain import Terrain
 
-ALONG = 1e-6  # columns/m, no ray is more nearly parallel to the border of a column
+ALONG = 1e-6  # columns/m, minimum slope of a ray against the borders of columns
 
 
 def profile_depth(
@@ -20,12 +20,12 @@ def profile_depth(
     y: Float[np.ndarray, "H 1"],
     camera: config.Camera,
 ) -> Float[Array, "H W"]:
-    """Return the depth of ground that is the same all across, m, or d_max where there is none.
+    """Render the depth of ground that is level across, m; d_max where a ray hits none.
 
-    Only a ray's slope along x matters, s = dz/|dx|. Seen from the camera a column hides all behind
-    it up to a slope m: that to its far upper edge if it is lower than the camera, to its near one
-    if not. A ray's column is the first with s <= m, and as many come before it as have a lower
-    running maximum of m. The columns are those forward from the camera's own, and those backward.
+    Only a ray's slope along x matters, s = dz/|dx|. Seen from the camera, a column hides everything
+    behind it up to a slope m: that of its far upper edge if it is lower than the camera, else of
+    its near one. A ray hits the first column with s <= m; its index is the number of columns whose
+    running maximum of m is below s. The columns run forward and backward from the camera's own.
     """
     to_x, to_z = (row[0] * x + row[1] * y + row[2] for row in (rotation[0], rotation[2]))
     per_x = 1.0 / jnp.maximum(jnp.abs(to_x), ALONG * ground.cell)
@@ -39,7 +39,7 @@ def profile_depth(
     middle = ground.origin[0] + (own + ahead + 0.5) * ground.cell
     across = jnp.broadcast_to(position[1], middle.shape)
     rise = terrain.height_at(ground, jnp.stack([middle, across], axis=-1)) - position[2]
-    behind = jnp.stack([place - own, own + 1.0 - place])[:, None]  # columns, of the own one
+    behind = jnp.stack([place - own, own + 1.0 - place])[:, None]  # columns, part of the own one
     near = jnp.maximum(jnp.abs(ahead) - behind, 0.0) * ground.cell
     far = (jnp.abs(ahead) + 1.0 - behind) * ground.cell
     hidden = jax.lax.cummax(rise / jnp.where(rise < 0.0, far, near), axis=1)
@@ -50,8 +50,8 @@ def profile_depth(
 
     def halve(k: Int[Array, ""], column: Int[Array, "H W"]) -> Int[Array, "H W"]:
         after = column + (1 << (count.bit_length() - 1) >> k)
-        passed = hidden.at[first + jnp.minimum(after, count) - 1].get(mode="promise_in_bounds")
-        return jnp.where((passed < slope) & (after <= count), after, column)
+        maximum = hidden.at[first + jnp.minimum(after, count) - 1].get(mode="promise_in_bounds")
+        return jnp.where((maximum < slope) & (after <= count), after, column)
 
     # the number of columns whose running maximum is below s
     column = jax.lax.fori_loop(0, count.bit_length(), halve, jnp.zeros(slope.shape, jnp.int32))
@@ -59,5 +59,5 @@ def profile_depth(
     of_ray = lambda values: values.reshape(-1)[index]
     top = jnp.where(slope < 0.0, of_ray(rise) / slope, 0.0)
     depth = jnp.maximum(of_ray(near), top) * per_x
-    seen = (column < count) & (depth < camera.d_max)  # not NaN, either
-    return jnp.where(seen, depth, camera.d_max)
+    is_hit = (column < count) & (depth < camera.d_max)  # False for NaN
+    return jnp.where(is_hit, depth, camera.d_max)

@@ -59,7 +59,7 @@ class BraxEnv(Env):
     @property
     def action_size(self) -> int:
         """The number of joints that the policy drives."""
-        return len(self.world.physics.robot.joint_names)
+        return self.world.physics.robot.num_joints
 
     @property
     def backend(self) -> str:
@@ -67,7 +67,7 @@ class BraxEnv(Env):
         return self._backend
 
     def reset(self, rng: PRNGKeyArray) -> State:
-        """Return a robot on a lane of a random kind, at one of the levels of the start."""
+        """Reset to a lane of a random kind at one of the start levels."""
         c, lanes = self.world.config, self.world.lanes
         key_kind, key_level, key_reset, key_see = jax.random.split(rng, 4)
         kind = jax.random.randint(key_kind, (), 0, len(lanes.kinds))
@@ -109,10 +109,10 @@ class BraxEnv(Env):
 
 
 class SelfResetting(Wrapper):
-    """Many robots that start again by themselves, with what brax's agents keep of an episode."""
+    """Environments that reset themselves, with the episode records that brax's agents keep."""
 
     def reset(self, rng: Array) -> State:
-        """Return a robot for each key."""
+        """Reset one environment per key."""
         state = jax.vmap(self.env.reset)(rng)
         zero = jnp.zeros_like(state.reward)
         sums = dict.fromkeys(("sum_reward", "length", *state.metrics), zero)
@@ -120,7 +120,7 @@ class SelfResetting(Wrapper):
         return state.replace(info={**state.info, **flags, "episode_metrics": sums})
 
     def step(self, state: State, action: Float[Array, "E J"]) -> State:
-        """Advance every robot; the sums are those of the episode that the step belongs to."""
+        """Step every environment; the sums are of the episode that the step belongs to."""
         after = jax.vmap(self.env.step)(state, action)
         goes_on = 1.0 - state.info["episode_done"]
         one = jnp.ones_like(after.reward)
@@ -142,7 +142,7 @@ def wrap(
     action_repeat: int = 1,
     randomization_fn: Callable[..., Any] | None = None,
 ) -> SelfResetting:
-    """Return the environment as `brax.training` wants it; give it as `wrap_env_fn`.
+    """Wrap the environment for `brax.training`, as its `wrap_env_fn`.
 
     Raises:
         ValueError: a setting that only the configuration of the environment can change.
@@ -155,7 +155,7 @@ def wrap(
 
 
 def mend_brax() -> None:
-    """Give jax back the function that brax 0.14.2 trains with and jax 0.10 has dropped.
+    """Restore the function that brax 0.14.2 calls and jax 0.10 dropped.
 
     google/brax#671; where it is there, nothing happens.
     """
@@ -164,11 +164,11 @@ def mend_brax() -> None:
 
 
 def _device_put_replicated(tree: Any, devices: list[Any]) -> Any:
-    """Return the tree with a new first axis, one entry on each device."""
+    """Copy a tree to each device, along a new first axis."""
     one_each = NamedSharding(Mesh(devices, ("devices",)), PartitionSpec("devices"))
     return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), one_each), tree)
 
 
 def _obs(seen: Observation) -> dict[str, Array]:
-    """Return the observation under the names that brax's networks look for."""
+    """Name the observation's parts as brax's networks expect."""
     return {"state": seen.proprioception, "privileged_state": seen.privileged}

@@ -11,7 +11,7 @@ from cref_jax.env.world import World
 
 
 def update_command(world: World, state: EnvState, draws: Draws) -> EnvState:
-    """Take a new command when one is due; if it leads along the lane, steer back to its middle."""
+    """Take a new command when due; along a lane, steer back to its middle."""
     c = world.config
     due = state.command_left <= 0
     command = jnp.where(due, draws.command, state.command)
@@ -36,7 +36,7 @@ def update_command(world: World, state: EnvState, draws: Draws) -> EnvState:
 def sample_command(
     world: World, key: PRNGKeyArray, kind: Int[Array, ""]
 ) -> tuple[Float[Array, "3"], Bool[Array, ""]]:
-    """Draw a velocity command, and whether the robot is steered along the lane meanwhile.
+    """Draw a velocity command, and whether the robot is then steered along its lane.
 
     In the open it is any direction, or to stand; on a lane forward, and at times as in the open, to
     stand as often as to go elsewhere.

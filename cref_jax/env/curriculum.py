@@ -11,7 +11,7 @@ from cref_jax.env.world import World
 def next_level(
     world: World, state: EnvState, over: Ending, key: PRNGKeyArray
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Return the rank after an episode, and the level of the next.
+    """Update the rank after an episode and draw the level of the next.
 
     A good episode on the level of its rank, from the start of the lane, earns the robot the next
     one, a poor one costs it this one: it went less than a share of what the whole episode asked
@@ -34,7 +34,7 @@ def next_level(
 
 
 def _commanded_distance(world: World, state: EnvState) -> Float[Array, ""]:
-    """Return the distance that the command asks for in a whole episode, at most the lane, m."""
+    """Compute the distance commanded over a whole episode, at most the lane's length, m."""
     c = world.config
     left = c.episode.length - state.step * c.physics.control_period
     asked = state.commanded + left * state.is_steered * jnp.linalg.norm(state.command[:2])

@@ -1,4 +1,4 @@
-"""One robot's observation and step: the wiring of physics, reward and episode.
+"""The observation and the step of one environment.
 
 Everything here is for one robot; `jax.vmap` over the state and the key makes thousands, with the
 world shared by all.
@@ -34,7 +34,7 @@ FAR = 1.0  # m, of a foothold, for the critic; assumed: beyond, the reward is no
 
 
 class Measures(NamedTuple):
-    """What the log and the evaluation look at, of the step that was made."""
+    """Measurements of one step, for logs and evaluation."""
 
     terms: dict[str, Float[Array, ""]]  # weighted reward terms, per second
     speed_error: Float[Array, ""]  # m/s, of the planar velocity
@@ -52,7 +52,7 @@ class Measures(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a step gives to the learner."""
+    """The result of a step, for the learner."""
 
     observation: Observation  # of the following state, which is a fresh one after an end
     last_privileged: Float[Array, " S"]  # s of the state reached, before any reset
@@ -62,7 +62,7 @@ class Outcome(NamedTuple):
 
 
 def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
-    """Return what the robot and the critic see in this state."""
+    """Compute the observations of policy and critic in this state."""
     c, robot = world.config, world.physics.robot
     clean = observations.motion(state.body.qpos, state.body.qvel, state.action.size)
     sensed = clean._replace(joint_position=clean.joint_position + state.joint_offset)
@@ -75,13 +75,13 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     hidden = _hidden_state(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),
-        privileged=observations.privileged(see(clean), clean.velocity, hidden, scan),
+        privileged=observations.privileged_state(see(clean), clean.velocity, hidden, scan),
         velocity=clean.velocity,
     )
 
 
 def _hidden_state(world: World, state: EnvState) -> Float[Array, " H"]:
-    """Gather what else decides rewards and motion: phases, footholds, a_{t-2}, what was drawn."""
+    """Gather what else decides rewards and motion: gait, footholds, a_{t-2}, sampled dynamics."""
     gait, dynamics = state.gait, state.dynamics
     row = observations.fine_row(_ground(world, state), state.body.qpos, world.config.scan)
     numbers = (state.since_single, dynamics.friction, dynamics.payload, state.delay)
@@ -105,7 +105,7 @@ def step(world: World, state: EnvState, action: Float[Array, " J"]) -> tuple[Env
 def step_all(
     world: World, state: EnvState, action: Float[Array, "E J"]
 ) -> tuple[EnvState, Outcome]:
-    """Advance E robots, each as `step` does.
+    """Step E environments, each as `step` does.
 
     Under `jax.vmap` a push, a command and an episode are drawn for every robot in every step; here,
     only in a step in which one of them is due.
@@ -125,7 +125,7 @@ def step_all(
 
 
 class _Reached(NamedTuple):
-    """Where a step has led to, before any reset."""
+    """The result of a step before any reset."""
 
     state: EnvState
     outcome: Outcome
@@ -139,7 +139,7 @@ def _step_without_reset(
     keys: Shaped[Array, "6 ..."],
     draws: Draws,
 ) -> _Reached:
-    """Return the state that a step leads to, as if the episode went on, and what it gives."""
+    """Advance one control step as if the episode continued."""
     c = world.config
     state = events.apply_push(world, state.replace(key=keys[0]), draws)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
@@ -174,7 +174,7 @@ def _step_without_reset(
 def _reset_if_over(
     world: World, lived: EnvState, outcome: Outcome, keys: Shaped[Array, "3 ..."]
 ) -> tuple[EnvState, Outcome]:
-    """Put the robot on a lane again if its episode is over, and observe it there."""
+    """Reset the environment if its episode is over, and observe the fresh state."""
     key_level, key_reset, key_see = keys
     done = outcome.ending.terminated | outcome.ending.truncated
     rank, level = curriculum.next_level(world, lived, outcome.ending, key_level)
@@ -186,7 +186,16 @@ def _reset_if_over(
 
 
 def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Float[Array, "H W"]:
-    """Return D, what the camera sees of the ground and of the robot's own links, normalised.
+    """Render D, the normalised depth image of the ground and of the robot's own links."""
+    camera = world.config.camera
+    metres = render_depth(world, state, is_profile)
+    return depth.normalize(depth.min_filter(metres, camera.window), camera)
+
+
+def render_depth(
+    world: World, state: EnvState, is_profile: bool = False, with_links: bool = True
+) -> Float[Array, "H W"]:
+    """Render the depth of the ground and, if wanted, of the robot's own links, m.
 
     `is_profile` says that the robot's lane is level across: see depth.render.
     """
@@ -195,10 +204,9 @@ def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Floa
     position, rotation = depth.pose(
         links, robot.camera, camera, state.camera_pitch, state.camera_shift
     )
-    capsules = depth.capsules_in_view(links, robot.capsules)
+    capsules = depth.capsules_in_view(links, robot.capsules) if with_links else jnp.zeros((0, 7))
     ground = _ground(world, state)
-    metres = depth.render(ground, position, rotation, capsules, camera, is_profile)
-    return depth.normalise(depth.nearest_around(metres, camera.window), camera)
+    return depth.render(ground, position, rotation, capsules, camera, is_profile)
 
 
 def _ground(world: World, state: EnvState) -> terrain.Terrain:
@@ -226,7 +234,7 @@ def _reward_snapshot(
     swings: gait.Swings,
     action: Float[Array, " J"],
 ) -> rewards.Snapshot:
-    """Return what the reward may look at, from the state before the step and the body after it.
+    """Collect the reward's inputs from the state before the step and the body after it.
 
     The feet's gait is that of after the step.
     """
@@ -257,7 +265,7 @@ def _reward_snapshot(
         air_time=swings.air_time,
         last_air_time=state.gait.last_air_time,
         foothold_distance=footholds.distance(state.candidates, soles.centre),
-        unsupported=footholds.unsupported(_ground(world, state), soles, c.foothold),
+        unsupported=footholds.count_unsupported(_ground(world, state), soles, c.foothold),
         since_single=jnp.where(single, 0.0, state.since_single + period),
         control_period=jnp.float32(period),
     )
@@ -266,7 +274,7 @@ def _reward_snapshot(
 def _next_state(
     world: World, state: EnvState, body: Body, soles: Soles, s: rewards.Snapshot
 ) -> EnvState:
-    """Return the state after the step, if the episode goes on."""
+    """Compute the state after the step, if the episode continues."""
     c = world.config
     touching = rewards.is_touching(s.foot_force, c.reward)
     support = rewards.support_height(s.foot_z, s.foot_force, c.reward)

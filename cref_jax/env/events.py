@@ -16,7 +16,7 @@ def is_draw_due(world: World, state: EnvState) -> Bool[Array, ""]:
 
 
 def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRNGKeyArray) -> Draws:
-    """Draw what `pushed` and `commanded` take where it is due."""
+    """Draw the next push and the next command, used where they are due."""
     c = world.config
     (key_shove, key_after), most = jax.random.split(key_push), c.randomisation.push_velocity
     key_next, key_left = jax.random.split(key_command)

@@ -24,7 +24,7 @@ _TINY = 1e-30  # keeps 0 / 0 at 0
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class Candidates:
-    """What each foot may step on, in its frame at its last liftoff."""
+    """Points where each foot may step, in its frame at its last liftoff."""
 
     x: Float[Array, "F K"]  # m, mean of the window
     z: Float[Array, "F K"]  # m, mean of the window
@@ -43,7 +43,7 @@ class Windows(NamedTuple):
 
 
 class Soles(NamedTuple):
-    """Where the feet are, in the world."""
+    """Poses of the feet in the world."""
 
     centre: Float[Array, "F 3"]  # m, of the sole
     ankle: Float[Array, "F 3"]  # m, origin of the ankle-roll frame
@@ -51,7 +51,7 @@ class Soles(NamedTuple):
 
 
 def soles(links: Links, robot: Robot) -> Soles:
-    """Return where the soles are: a sole's centre is that of its contact spheres' lowest points."""
+    """Compute the soles' poses; a centre is the mean of the contact spheres' lowest points."""
     spheres, ankles = robot.spheres, np.array(robot.ankles)
     lowest = spheres.position - np.array([0.0, 0.0, 1.0], np.float32) * spheres.radius[:, None]
     centre = np.stack([lowest[spheres.foot == foot].mean(axis=0) for foot in range(2)])
@@ -63,7 +63,7 @@ def soles(links: Links, robot: Robot) -> Soles:
 
 
 def no_candidates(c: config.Foothold) -> Candidates:
-    """Return the candidates before the first liftoff of an episode: not one is accepted."""
+    """Return candidates of which none is accepted, as before the first liftoff."""
     shape = (2, _count(c))
     return Candidates(
         x=jnp.zeros(shape),
@@ -81,7 +81,7 @@ def candidates(
     forward_command: Float[Array, ""],
     c: config.Foothold,
 ) -> Candidates:
-    """Return the windows ahead of each foot, and which of them are planar, level and not recessed.
+    """Find the windows ahead of each foot that are planar, level and not recessed.
 
         rho < r_th,    |v_1z| > eta_th,    mu_z > h_min
 
@@ -106,7 +106,7 @@ def candidates(
 
 
 def windows(z: Float[Array, "*n X Y"], c: config.Foothold) -> Windows:
-    """Return mean, roughness and verticality of each window of points at the heights `z`.
+    """Compute mean, roughness and verticality of each window of points at heights `z`.
 
         mu = 1/n sum p_i,    Sigma = 1/max(n - 1, 1) sum (p_i - mu)(p_i - mu)^T
         Sigma v_j = lambda_j v_j,    rho = sqrt(max(lambda_1, 0))
@@ -121,7 +121,7 @@ def windows(z: Float[Array, "*n X Y"], c: config.Foothold) -> Windows:
 def _windows(
     columns: list[Float[Array, "*n X"]], remain: Bool[ArrayLike, "K L"], c: config.Foothold
 ) -> Windows:
-    """Return the same, from the heights of each column of points along the foot.
+    """Compute the same from the heights of each column of points along the foot.
 
     `remain` says which rows of each window count; one without any has no shape.
     """
@@ -156,7 +156,7 @@ def _windows(
 
 
 def update_candidates(before: Candidates, now: Candidates, bears: Bool[Array, " F"]) -> Candidates:
-    """Return the new candidates of the feet that bear on the ground, and the old of the others.
+    """Take new candidates for the feet on the ground, and keep the others' old ones.
 
     So a foot that has lifted off has those of its last contact, where they were in the world, until
     it is down again.
@@ -176,14 +176,14 @@ def distance(frozen: Candidates, sole: Float[Array, "F 3"]) -> Float[Array, " F"
 
 
 def points(frozen: Candidates) -> Float[Array, "F K 3"]:
-    """Return the accepted candidates in the world, m, to be drawn; NaN where one is refused."""
+    """Compute the accepted candidates in the world, m, for drawing; NaN where refused."""
     ahead = jnp.stack([frozen.x, jnp.zeros_like(frozen.x), frozen.z], axis=-1)
     place = frozen.origin[:, None] + geometry.rotate_yaw(frozen.heading[:, None], ahead)
     return jnp.where(frozen.accepted[..., None], place, jnp.nan)
 
 
-def unsupported(ground: Terrain, feet: Soles, c: config.Foothold) -> Int[Array, " F"]:
-    """Return how many of each sole's samples are over nothing: d_ij = z_ground - z_sole < epsilon.
+def count_unsupported(ground: Terrain, feet: Soles, c: config.Foothold) -> Int[Array, " F"]:
+    """Count each sole's samples without support: d_ij = z_ground - z_sole < epsilon.
 
     After BeamDojo (arXiv 2502.10363). The samples lie about the ankle's origin, turned by the
     foot's yaw; z_sole is the centre's.
@@ -201,12 +201,12 @@ def _count(c: config.Foothold) -> int:
 
 
 def _rows(c: config.Foothold) -> Int[np.ndarray, "K L"]:
-    """Return the rows of the buffer that each window is of."""
+    """Return the buffer rows of each window."""
     return c.stride * np.arange(_count(c))[:, None] + np.arange(c.window[0])
 
 
 def _lattice(c: config.Foothold) -> tuple[Float[np.ndarray, " X"], Float[np.ndarray, " Y"]]:
-    """Return x and y of the buffer's points in the foot frame, m: x from half a spacing on."""
+    """Compute x and y of the buffer's points in the foot frame, m; x starts at half a spacing."""
     x = (np.arange(c.points[0]) + 0.5) * c.spacing[0]
     y = (np.arange(c.points[1]) - 0.5 * (c.points[1] - 1)) * c.spacing[1]
     return x.astype(np.float32), y.astype(np.float32)
@@ -215,11 +215,11 @@ def _lattice(c: config.Foothold) -> tuple[Float[np.ndarray, " X"], Float[np.ndar
 def _heights(
     ground: Terrain, sole: Float[Array, "F 3"], heading: Float[Array, " F"], c: config.Foothold
 ) -> list[Float[Array, "F X"]]:
-    """Return the ground's height above each sole at each column of its foot's buffer, m."""
+    """Look up the ground's height above each sole at each column of its buffer, m."""
     x, y = _lattice(c)
     # the points of one column after the other, as `_windows` takes them
     ahead, aside = np.tile(x, len(y)), np.repeat(y, len(x))
-    by_x, by_y = geometry.turned_yaw(heading[:, None], ahead[None], aside[None])
+    by_x, by_y = geometry.rotate_yaw_xy(heading[:, None], ahead[None], aside[None])
     z = terrain.height_under(ground, sole[:, :1] + by_x, sole[:, 1:2] + by_y)
     return list((z - sole[:, 2:]).reshape(2, len(y), len(x)).swapaxes(0, 1))
 
@@ -229,7 +229,7 @@ def _flattest(
     across: tuple[Float[Array, " K"], Float[Array, "*n"]],
     zz: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return lambda_1 of the covariance [[a, 0, p], [0, b, q], [p, q, zz]] and |v_1z|.
+    """Compute lambda_1 of the covariance [[a, 0, p], [0, b, q], [p, q, zz]] and |v_1z|.
 
     `along` is (a, p) and `across` (b, q). With b <= a, lambda_1 is the one root up to b of
 

@@ -23,14 +23,14 @@ class Gait:
 
 
 class Swings(NamedTuple):
-    """The swings that have ended in this control step."""
+    """Swings that ended in this control step."""
 
     touchdown: Bool[Array, " F"]
     air_time: Float[Array, " F"]  # s, from the last contact before the swing to the first after it
 
 
 def standing_gait() -> Gait:
-    """Both feet are down, and no swing has been seen."""
+    """Return the gait of a robot that stands: both feet down, no swing yet."""
     still = jnp.zeros(2)
     return Gait(jnp.ones(2, bool), jnp.zeros(2, jnp.int32), still, still)
 
@@ -38,7 +38,7 @@ def standing_gait() -> Gait:
 def update_gait(
     before: Gait, touching: Bool[Array, " F"], period: float, debounce: int
 ) -> tuple[Gait, Swings]:
-    """Follow the feet through a control step of `period` seconds.
+    """Update the gait for a control step of `period` s.
 
     A foot changes its phase when `debounce` steps in a row have said so. The air time leaves the
     steps out in which the touchdown was confirmed.

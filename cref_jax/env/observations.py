@@ -1,4 +1,4 @@
-"""What the policy and the critic see: Eq. 1-3."""
+"""Observations of the policy and of the critic: Eq. 1-3."""
 
 from typing import NamedTuple
 
@@ -51,7 +51,7 @@ PARTS = (  # Eq. 2, in its order
 
 
 def slices(num_joints: int) -> dict[str, slice]:
-    """Return where each part of o^p_t lies."""
+    """Compute the slice of each part of o^p_t."""
     widths = [part.size or num_joints for part in PARTS]
     ends = np.cumsum(widths).tolist()
     return {
@@ -61,13 +61,13 @@ def slices(num_joints: int) -> dict[str, slice]:
 
 
 def num_joints_of(size: int) -> int:
-    """Return the number of joints of an o^p_t with `size` numbers."""
+    """Compute the number of joints from the size of o^p_t."""
     fixed = sum(part.size for part in PARTS)
     return (size - fixed) // sum(part.size == 0 for part in PARTS)
 
 
 def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"], joints: int) -> Motion:
-    """Return the motion in the body frame; MuJoCo's free joint has its velocity in the world's.
+    """Compute the motion in the body frame; MuJoCo's free joint has its velocity in the world's.
 
     `joints` is J, how many the policy drives; those that are held come after them.
     """
@@ -84,7 +84,7 @@ def motion(qpos: Float[Array, " Q"], qvel: Float[Array, " V"], joints: int) -> M
 def with_noise(
     clean: Motion, c: config.Randomisation, spread: Float[ArrayLike, ""], key: PRNGKeyArray
 ) -> Motion:
-    """Return the motion with a share of the uniform sensor noise; no sensor has the velocity."""
+    """Add a share of the uniform sensor noise; no sensor measures the velocity."""
     keys = jax.random.split(key, 4)
     draw = lambda k, x, width: jax.random.uniform(k, x.shape, minval=-width, maxval=width)
     noise = lambda k, x, width: x + spread * draw(k, x, width)
@@ -125,7 +125,7 @@ def height_scan(
 def fine_row(
     ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
 ) -> Float[Array, " A"]:
-    """Return the same along a row straight ahead, fine enough to place the edge of a tread."""
+    """Compute the same along a row straight ahead, fine enough to locate the edge of a tread."""
     x = np.linspace(*c.ahead)
     return _clearance(ground, qpos, x, np.zeros_like(x), c)
 
@@ -138,12 +138,12 @@ def _clearance(
     c: config.Scan,
 ) -> Float[Array, " N"]:
     grid = (x.astype(np.float32), y.astype(np.float32))
-    by_x, by_y = geometry.turned_yaw(geometry.yaw(qpos[3:7]), *grid)
+    by_x, by_y = geometry.rotate_yaw_xy(geometry.yaw(qpos[3:7]), *grid)
     clearance = qpos[2] - terrain.height_under(ground, qpos[0] + by_x, qpos[1] + by_y)
     return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
 
 
-def privileged(
+def privileged_state(
     clean: Float[Array, " O"],
     velocity: Float[Array, "3"],
     hidden: Float[Array, " H"],

@@ -21,10 +21,10 @@ def reset(
     level: Int[Array, ""],
     spread: Spread | None = None,
 ) -> EnvState:
-    """Return a robot on a lane of that kind and level; the whole randomisation without a spread."""
+    """Put a robot on a lane of this kind and level; without a spread, fully randomised."""
     c = world.config
     keys = jax.random.split(key, 8)
-    joints = len(world.physics.robot.joint_names)
+    joints = world.physics.robot.num_joints
     spread = even_spread(1.0) if spread is None else spread
     variant = jax.random.randint(keys[7], (), 0, world.lanes.variants)
     body = _sample_start(world, keys[0], kind, level, variant)
@@ -70,7 +70,7 @@ def _sample_start(
     level: Int[Array, ""],
     variant: Int[Array, ""],
 ) -> Body:
-    """Return a settled state from the bank, turned a little.
+    """Sample a settled state from the bank, turned a little.
 
     It stands somewhere on the lane's start, or for a share of the episodes on another level stretch
     of it.
@@ -84,7 +84,7 @@ def _sample_start(
     about_z = geometry.quat_from_axis_angle(jnp.array([0.0, 0.0, 1.0]), turn)
     x, z = uniform(key_x, *c.start_x), jnp.zeros(())
     if c.start_anywhere > 0.0:
-        there, height = world.lanes.level_place(kind, level, variant, key_where)
+        there, height = world.lanes.sample_level_place(kind, level, variant, key_where)
         elsewhere = (jax.random.uniform(key_x) < c.start_anywhere) & jnp.isfinite(there)
         x, z = jnp.where(elsewhere, there, x), jnp.where(elsewhere, height, z)
     place = jnp.stack([x, uniform(key_y, *c.start_y), body.qpos[2] + z])

@@ -15,7 +15,7 @@ from cref_jax.robot import Robot
 
 
 class Snapshot(NamedTuple):
-    """What the reward may look at. SI units; F = 2 feet (left, right), J joints.
+    """Inputs of the reward. SI units; F = 2 feet (left, right), J joints.
 
     The base's velocities and gravity are in the body frame, the feet in the world frame.
     """
@@ -233,7 +233,7 @@ EVENTS = tuple(name for name, term in TERMS.items() if term in _EVENTS)
 def total(
     s: Snapshot, c: config.Reward, robot: Robot
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Return the step's reward, and each weighted term under its name for the log.
+    """Compute the reward of a step, and each weighted term by name for the log.
 
     The sum is scaled by the control period, touchdowns by their own time instead. The sum of the
     other terms is cut at 0 from below; touchdowns are not: cut off, a short step would cost nothing

@@ -8,7 +8,7 @@ STALL_SHARE = 0.3  # of the commanded distance; assumed: far below what any walk
 
 
 def stalled_at(progress: Float[np.ndarray, " T"], speed: float, period: float) -> int | None:
-    """Return the first control step at which the robot has stalled, None if it never has.
+    """Find the first control step at which the robot has stalled, None if it never does.
 
     It has stalled at step t if it has come less than `STALL_SHARE` of the commanded distance
     forward between step t - `STALL_SECONDS` and step t; at the earliest after `STALL_SECONDS`.
@@ -25,7 +25,7 @@ def stalled_at(progress: Float[np.ndarray, " T"], speed: float, period: float) -
 def stalls(
     progress: Float[np.ndarray, "T E"], speed: Float[np.ndarray, " E"], period: float
 ) -> Int[np.ndarray, " E"]:
-    """Return for each of E robots what `stalled_at` says, T where it never stalls."""
+    """Compute `stalled_at` for each of E robots, T where one never stalls."""
     steps = len(progress)
     window = round(STALL_SECONDS / period)
     if steps <= window:

@@ -12,7 +12,7 @@ from cref_jax.physics.records import Body, Dynamics
 
 
 class Spread(NamedTuple):
-    """What share of its ranges each part of the randomisation has, 0 to 1."""
+    """Share of its ranges that each part of the randomisation uses, 0 to 1."""
 
     friction: Float[ArrayLike, ""]
     mass: Float[ArrayLike, ""]  # of the trunk, and where its centre is
@@ -83,7 +83,7 @@ class Ending(NamedTuple):
 
     @property
     def truncated(self) -> Bool[ArrayLike, "..."]:
-        """The episode was cut although the robot could have gone on."""
+        """The episode was cut although the robot could have continued."""
         return (self.finished | self.timeout | self.stalled) & ~self.terminated
 
 

@@ -14,7 +14,7 @@ from cref_jax.robot.kinematics import Links
 def check_termination(
     world: World, state: EnvState, links: Links, unstable: Bool[Array, ""]
 ) -> Ending:
-    """Judge the state that a step has led to."""
+    """Check the reached state for every reason to end the episode."""
     c = world.config
     gravity_z = geometry.rotate_inverse(state.body.qpos[3:7], jnp.array([0.0, 0.0, -1.0]))[2]
     foot_z = links.position[world.physics.feet, 2]
@@ -33,13 +33,13 @@ def check_termination(
 
 
 def record_progress(world: World, state: EnvState) -> EnvState:
-    """Note where the robot is when it is looked at for a stall."""
+    """Record progress at each stall check."""
     here = jnp.stack([state.body.qpos[0], state.commanded])
     return state.replace(mark=jnp.where(_is_stall_check(world, state), here, state.mark))
 
 
 def _is_stall_check(world: World, state: EnvState) -> Bool[Array, ""]:
-    """Return whether this is a step at which a robot is looked at for a stall."""
+    """Return whether a stall check is due in this step."""
     c = world.config
     if c.episode.stall_time == 0.0:
         return jnp.zeros((), bool)
@@ -47,7 +47,7 @@ def _is_stall_check(world: World, state: EnvState) -> Bool[Array, ""]:
 
 
 def _has_stalled(world: World, state: EnvState) -> Bool[Array, ""]:
-    """Return whether the robot has hardly come forward since the last look.
+    """Return whether the robot has hardly advanced since the last stall check.
 
     It is not judged where it was told to stand, or to go elsewhere, for a part of that time.
     """

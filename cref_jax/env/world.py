@@ -1,4 +1,4 @@
-"""What all robots share: the configuration, the physics, the lanes and a bank of first states."""
+"""What all environments share: settings, physics, lanes and a bank of initial states."""
 
 from typing import no_type_check
 
@@ -18,7 +18,7 @@ from cref_jax.terrain.atlas import Atlas
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
 @flax.struct.dataclass
 class World:
-    """What all robots share. The arrays travel as arguments, so no program has them built in."""
+    """What all environments share; arrays are arguments of programs, not constants in them."""
 
     config: Config = flax.struct.field(pytree_node=False)
     physics: Physics = flax.struct.field(pytree_node=False)
@@ -27,16 +27,16 @@ class World:
 
 
 def make_world(c: Config, physics: Physics) -> World:
-    """Build the terrain and settle the robots that episodes start from.
+    """Build the terrain and settle the states that episodes start from.
 
     Raises:
         ConfigError: the terrain is unknown or its numbers cannot be used.
     """
-    return World(c, physics, lanes.build(c.terrain), _settled(c, physics))
+    return World(c, physics, lanes.build(c.terrain), _settle_robots(c, physics))
 
 
-def _settled(c: Config, physics: Physics) -> Body:
-    """Return `bank_size` states that have stood on flat ground for `settle_time`."""
+def _settle_robots(c: Config, physics: Physics) -> Body:
+    """Simulate `bank_size` robots standing on flat ground for `settle_time`."""
     flat = terrain.from_heights(jnp.zeros((1, 1)), c.terrain.cell, (0.0, 0.0))
     robot, nominal = physics.robot, physics.nominal_dynamics()
     steps = round(c.episode.settle_time / c.physics.control_period)
@@ -59,10 +59,10 @@ def _settled(c: Config, physics: Physics) -> Body:
 
 
 def build_world(c: Config, engine: EngineName = "auto", threads: int = 0) -> World:
-    """Return the world that a configuration describes; `threads` is as in Physics."""
+    """Build the world of a configuration; `threads` as in Physics."""
     return make_world(c, build_physics(c, engine, threads))
 
 
 def build_physics(c: Config, engine: EngineName = "auto", threads: int = 0) -> Physics:
-    """Return the physics that a configuration describes; `threads` is as in Physics."""
+    """Build the physics of a configuration; `threads` as in Physics."""
     return Physics(c.robot, c.physics, resolve_engine(engine), threads)

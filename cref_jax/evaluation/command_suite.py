@@ -1,4 +1,4 @@
-"""How well a policy does what it is told on level ground: to stand, to walk, to turn, to stop."""
+"""Command tracking on level ground: standing, walking, turning and stopping."""
 
 from typing import Any, NamedTuple
 
@@ -16,8 +16,8 @@ from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 from cref_jax.training import rollout
 
-SECONDS = 10.0  # of a trial; assumed
-SETTLING = 2.0  # s that a robot has to come to rest or to speed; assumed
+SECONDS = 10.0  # per trial; assumed
+SETTLING = 2.0  # s to come to rest or up to speed; assumed
 STAND = (0.0, 0.0, 0.0)
 GRID = (  # m/s forward, m/s to the left, rad/s to the left
     STAND,
@@ -25,82 +25,84 @@ GRID = (  # m/s forward, m/s to the left, rad/s to the left
     *((0.0, vy, 0.0) for vy in (-0.3, 0.3)),
     *((0.0, 0.0, rate) for rate in (-1.0, -0.5, 0.5, 1.0)),
 )
-STOP = (0.6, 0.0, 0.0)  # before a robot is told to stop
-WALKS = 5.0  # s that it walks before; assumed
-DRIFT = 0.05  # m that a robot that stands may move; assumed
+STOP = (0.6, 0.0, 0.0)  # before the command to stop
+WALKS = 5.0  # s of walking before that command; assumed
+DRIFT = 0.05  # m that a standing robot may move; assumed
 
 
 class Trace(NamedTuple):
-    """What E robots do at T control steps."""
+    """Motion of E robots over T control steps."""
 
     position: Float[Array | np.ndarray, "T E 2"]  # m, world
-    velocity: Float[Array | np.ndarray, "T E 3"]  # m/s forward and to the left, rad/s; body
+    velocity: Float[Array | np.ndarray, "T E 3"]  # m/s forward and to the left, rad/s; body frame
     touchdown: Bool[Array | np.ndarray, "T E F"]
     airborne: Bool[Array | np.ndarray, "T E F"]
-    fallen: Bool[Array | np.ndarray, "T E"]  # in this step or before
+    fallen: Bool[Array | np.ndarray, "T E"]  # in this step or earlier
 
 
 def run_commands(
     c: Config, physics: Physics, train: ppo.TrainState, count: int, seed: int
 ) -> dict[str, Any]:
-    """Judge `count` trials of each command, and as many of being told to stop."""
-    told = np.repeat(np.array([*GRID, STOP], np.float32), count, axis=0)
+    """Run `count` trials per command, and `count` trials of the command to stop."""
+    commands = np.repeat(np.array([*GRID, STOP], np.float32), count, axis=0)
     steps = round(SECONDS / c.physics.control_period)
-    stop = np.full(len(told), steps)
+    stop = np.full(len(commands), steps)
     stop[-count:] = round(WALKS / c.physics.control_period)
-    world, number = _world(c, physics), np.arange(len(told))
-    robots = trials.begin(world, seed, number, 0 * number, 0 * number)
-    seen = _obey(world, train, robots, jnp.asarray(told), jnp.asarray(stop), steps)
-    seen = Trace(*map(np.asarray, seen))
+    world, number = _flat_world(c, physics), np.arange(len(commands))
+    robots = trials.start_robots(world, seed, number, 0 * number, 0 * number)
+    trace = _record_trace(world, train, robots, jnp.asarray(commands), jnp.asarray(stop), steps)
+    trace = Trace(*map(np.asarray, trace))
     period = c.physics.control_period
-    of = lambda k: Trace(*(x[:, k * count : (k + 1) * count] for x in seen))
-    rows = [row(of(k), command, period) for k, command in enumerate(GRID)]
-    return {"commands": rows, "stop": stopped(of(len(GRID)), period)}
+    of = lambda k: Trace(*(x[:, k * count : (k + 1) * count] for x in trace))
+    rows = [summarize_command(of(k), command, period) for k, command in enumerate(GRID)]
+    return {"commands": rows, "stop": summarize_stop(of(len(GRID)), period)}
 
 
-def row(seen: Trace, command: tuple[float, float, float], period: float) -> dict[str, Any]:
-    """Return how well one command was obeyed after `SETTLING` seconds, by those on their feet."""
-    first, upright = round(SETTLING / period), ~seen.fallen[-1]
-    mean = seen.velocity[first:].mean(axis=0)[upright]  # [E, 3]
-    far = np.linalg.norm(seen.position - seen.position[0], axis=-1).max(axis=0)
-    steps = seen.touchdown[first:].any(axis=(0, 2))
-    airborne = seen.airborne[first:].mean(axis=0)[upright]
-    nothing = not upright.any()
-    found: dict[str, Any] = {
+def summarize_command(
+    trace: Trace, command: tuple[float, float, float], period: float
+) -> dict[str, Any]:
+    """Compute how well one command was tracked after `SETTLING` s, by the robots still upright."""
+    first, upright = round(SETTLING / period), ~trace.fallen[-1]
+    mean = trace.velocity[first:].mean(axis=0)[upright]  # [E, 3]
+    farthest = np.linalg.norm(trace.position - trace.position[0], axis=-1).max(axis=0)
+    steps = trace.touchdown[first:].any(axis=(0, 2))
+    airborne = trace.airborne[first:].mean(axis=0)[upright]
+    all_fell = not upright.any()
+    result: dict[str, Any] = {
         "command": list(command),
         "trials": int(upright.size),
         "fell": int((~upright).sum()),
-        "velocity": None if nothing else mean.mean(axis=0).tolist(),
-        "error": None if nothing else np.abs(mean - command).mean(axis=0).tolist(),
-        "airborne": None if nothing else airborne.mean(axis=0).tolist(),
+        "velocity": None if all_fell else mean.mean(axis=0).tolist(),
+        "error": None if all_fell else np.abs(mean - command).mean(axis=0).tolist(),
+        "airborne": None if all_fell else airborne.mean(axis=0).tolist(),
     }
     if command == STAND:
-        found |= {
-            "stood": int((upright & (far < DRIFT)).sum()),
+        result |= {
+            "stood": int((upright & (farthest < DRIFT)).sum()),
             "still": int((upright & ~steps).sum()),
-            "drift_m": None if nothing else float(np.median(far[upright])),
+            "drift_m": None if all_fell else float(np.median(farthest[upright])),
         }
-    return found
+    return result
 
 
-def stopped(seen: Trace, period: float) -> dict[str, Any]:
-    """Return how far robots come after they are told to stop, m, until the end of the trial."""
-    first, upright = round(WALKS / period), ~seen.fallen[-1]
-    way = np.linalg.norm(seen.position[-1] - seen.position[first], axis=-1)[upright]
+def summarize_stop(trace: Trace, period: float) -> dict[str, Any]:
+    """Compute the distance from the command to stop until the end of the trial, m."""
+    first, upright = round(WALKS / period), ~trace.fallen[-1]
+    distance = np.linalg.norm(trace.position[-1] - trace.position[first], axis=-1)[upright]
     return {
         "trials": int(upright.size),
         "fell": int((~upright).sum()),
-        "distance_m": float(np.median(way)) if way.size else None,
+        "distance_m": float(np.median(distance)) if distance.size else None,
     }
 
 
-def text(found: dict[str, Any]) -> Table:
-    """Return the table for the terminal."""
+def to_table(result: dict[str, Any]) -> Table:
+    """Build the table for the terminal."""
     table = Table(box=None, padding=(0, 1))
-    for column in ("told", "does", "error", "fell", "feet up, %"):
+    for column in ("command", "velocity", "error", "fell", "feet up, %"):
         table.add_column(column, justify="right", no_wrap=True)
     numbers = lambda values, form: "" if values is None else " ".join(form % x for x in values)
-    for r in found["commands"]:
+    for r in result["commands"]:
         air = numbers(r["airborne"] and [100.0 * x for x in r["airborne"]], "%.0f")
         parts = ((r["command"], "%4.1f"), (r["velocity"], "%5.2f"), (r["error"], "%4.2f"))
         table.add_row(*(numbers(*part) for part in parts), f"{r['fell']} of {r['trials']}", air)
@@ -108,62 +110,60 @@ def text(found: dict[str, Any]) -> Table:
     return table
 
 
-def lines(found: dict[str, Any]) -> str:
-    """Return in words how the robot stands and stops."""
-    stand = next(r for r in found["commands"] if tuple(r["command"]) == STAND)
-    stop, metres = found["stop"], lambda x: "-" if x is None else f"{x:.2f} m"
+def describe(result: dict[str, Any]) -> str:
+    """Describe in words how the robot stands and stops."""
+    stand = next(r for r in result["commands"] if tuple(r["command"]) == STAND)
+    stop, metres = result["stop"], lambda x: "-" if x is None else f"{x:.2f} m"
     return (
-        f"told to stand for {SECONDS:.0f} s: {stand['stood']} of {stand['trials']} within "
+        f"standing for {SECONDS:.0f} s: {stand['stood']} of {stand['trials']} within "
         f"{100 * DRIFT:.0f} cm, {stand['still']} without a step after {SETTLING:.0f} s, median "
         f"drift {metres(stand['drift_m'])}\n"
-        f"told to stop at {STOP[0]} m/s: {metres(stop['distance_m'])} further, "
+        f"stopping from {STOP[0]} m/s: {metres(stop['distance_m'])} further, "
         f"{stop['fell']} of {stop['trials']} fell"
     )
 
 
-def _world(c: Config, physics: Physics) -> World:
-    """Return a flat lane on which no command is drawn."""
-    flat = lanes.grid(c.terrain, {"flat": (0.0,)}, (1,))
+def _flat_world(c: Config, physics: Physics) -> World:
+    """Build a world with a flat lane on which no command is sampled."""
+    flat = lanes.build_grid(c.terrain, {"flat": (0.0,)}, (1,))
     return make_world(protocol.trial_config(c), physics).replace(lanes=flat)
 
 
 @jax.jit(static_argnames="steps")
-def _obey(
+def _record_trace(
     world: World,
     train: ppo.TrainState,
     robots: rollout.Robots,
-    told: Float[Array, "E 3"],
+    commands: Float[Array, "E 3"],
     stop: Int[Array, " E"],
     steps: int,
 ) -> Trace:
-    """Walk robots that are told this, and from step `stop` on to stand."""
-    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+    """Walk the robots with these commands, and with the one to stand from step `stop` on."""
 
     def step(carry: tuple[rollout.Robots, Bool[Array, " E"]], k: Int[Array, ""]) -> Any:
         robots, fallen = carry
-        command = jnp.where((k < stop)[:, None], told, 0.0)
-        robots = _told(robots, command)
-        memory, policy = rollout.policy_step(nets, train, robots)
-        robots, outcome = rollout.env_step(world, robots, memory, policy.mean[0])
+        command = jnp.where((k < stop)[:, None], commands, 0.0)
+        robots = _set_command(robots, command)
+        robots, _policy, outcome = rollout.step_policy(world, train, robots)
         fallen = fallen | outcome.ending.terminated
         body = robots.env.body
         ahead = jax.vmap(geometry.rotate_inverse)(body.qpos[:, 3:7], body.qvel[:, :3])[:, :2]
         velocity = jnp.concatenate([ahead, body.qvel[:, 5:6]], axis=1)
-        seen = Trace(
+        trace = Trace(
             body.qpos[:, :2],
             velocity,
             outcome.measures.touchdown,
             outcome.measures.airborne,
             fallen,
         )
-        return (robots, fallen), seen
+        return (robots, fallen), trace
 
-    return jax.lax.scan(step, (robots, jnp.zeros(len(told), bool)), jnp.arange(steps))[1]
+    return jax.lax.scan(step, (robots, jnp.zeros(len(commands), bool)), jnp.arange(steps))[1]
 
 
-def _told(robots: rollout.Robots, command: Float[Array, "E 3"]) -> rollout.Robots:
-    """Return the robots with another command, in what they see of it, too."""
+def _set_command(robots: rollout.Robots, command: Float[Array, "E 3"]) -> rollout.Robots:
+    """Set the robots' command, in their state and in their observation."""
     env = robots.env.replace(command=command, is_steered=jnp.zeros(len(command), bool))
-    seen = robots.observation
-    sees = seen.proprioception.at[:, 6:9].set(command)
-    return robots.replace(env=env, observation=seen._replace(proprioception=sees))
+    observation = robots.observation
+    obs = observation.proprioception.at[:, 6:9].set(command)
+    return robots.replace(env=env, observation=observation._replace(proprioception=obs))

@@ -1,4 +1,4 @@
-"""How often a policy crosses lanes of one kind with obstacles of one size."""
+"""Success rate of a policy on lanes of one kind with obstacles of one size."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,25 +16,24 @@ from cref_jax.terrain import generators, lanes
 from cref_jax.training import rollout
 
 
-class Crossing(NamedTuple):
-    """The outcome of trials on lanes of one kind with obstacles of one size."""
+class LaneResult(NamedTuple):
+    """Outcome of trials on lanes of one kind with obstacles of one size."""
 
     kind: str
-    size_m: float  # of a slope its gradient
+    size_m: float  # the gradient of a slope
     trials: int
-    successes: int  # came to the lane's end in time
+    successes: int  # reached the lane's end in time
     by_cause: dict[str, int]  # of the failures
     seconds: float  # mean time of a success
     speed: float  # m/s forward, mean over the trials
-    sideways: dict[str, float] | None = (
-        None  # m, see lateral_drift.summarize; None for a robot in another simulation
-    )
+    sideways: dict[str, float] | None = None
+    """m, see lateral_drift.summarize; None in the whole-robot simulator"""
 
     def line(self) -> str:
-        """Return the outcome in one line for people."""
+        """Format the outcome as one line."""
         causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
         return (
-            f"{self.kind} {generators.extent(self.kind, self.size_m)}: {self.successes} of "
+            f"{self.kind} {generators.format_size(self.kind, self.size_m)}: {self.successes} of "
             f"{self.trials} trials crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
             + (f"; failures: {causes}" if causes else "")
         )
@@ -48,36 +47,38 @@ def cross(
     size: float,
     count: int = 200,
     seed: int = 0,
-    ended: Callable[[int], None] = lambda count: None,
-) -> Crossing:
-    """Return how often the policy's mean action comes to the end of lanes with such obstacles."""
+    on_finished: Callable[[int], None] = lambda count: None,
+) -> LaneResult:
+    """Run trials of the policy's mean action on lanes with these obstacles."""
     world = crossing_world(c, physics, kind, size)
-    asked = trials.Asked(np.arange(count), *crossing_lanes(count))
-    made = trials.run(world, trials.follow(train), asked, seed, protocol.robots_per_block(), ended)
-    done = made.succeeded
-    return Crossing(
+    specs = trials.TrialSpecs(np.arange(count), *crossing_lanes(count))
+    outcomes = trials.run(
+        world, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
+    )
+    succeeded = outcomes.succeeded
+    return LaneResult(
         kind=kind,
         size_m=size,
         trials=count,
-        successes=int(done.sum()),
-        by_cause=made.failures(),
-        seconds=float(made.seconds[done].mean()) if done.any() else float("nan"),
-        speed=float(made.forward.mean()),
-        sideways=lateral_drift.summarize(made.drift, made.aside),
+        successes=int(succeeded.sum()),
+        by_cause=outcomes.failures(),
+        seconds=float(outcomes.seconds[succeeded].mean()) if succeeded.any() else float("nan"),
+        speed=float(outcomes.forward.mean()),
+        sideways=lateral_drift.summarize(outcomes.drift, outcomes.aside),
     )
 
 
 def crossing_world(c: Config, physics: Physics, kind: str, size: float) -> World:
-    """Return the world of trials on lanes of one kind with obstacles of one size, m."""
-    atlas = lanes.grid(c.terrain, {kind: (size,)}, LANE_SEEDS)
+    """Build the world of trials on lanes of one kind with obstacles of one size, m."""
+    atlas = lanes.build_grid(c.terrain, {kind: (size,)}, LANE_SEEDS)
     return make_world(protocol.trial_config(c), physics).replace(lanes=atlas)
 
 
 def crossing_lanes(count: int) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-    """Return kind and level of the lanes of so many trials in `crossing_world`: each in turn."""
+    """Return kind and level of each trial's lane in `crossing_world`, round-robin."""
     return np.zeros(count, np.int32), np.arange(count, dtype=np.int32) % len(LANE_SEEDS)
 
 
 def first_robots(world: World, seed: int, count: int) -> rollout.Robots:
-    """Return the robots as the trials of this seed begin in `crossing_world`."""
-    return trials.begin(world, seed, np.arange(count), *crossing_lanes(count))
+    """Place robots at the start of this seed's first trials in `crossing_world`."""
+    return trials.start_robots(world, seed, np.arange(count), *crossing_lanes(count))

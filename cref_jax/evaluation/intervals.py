@@ -1,19 +1,19 @@
-"""How sure a success rate is: intervals of one, of a difference and of a mean, at 95 %.
+"""95 % confidence intervals of a success rate, of a difference and of a mean.
 
-The interval of one rate is Wilson's score interval. Those of a difference and of a mean are made of
-it (R. Newcombe, "Interval estimation for the difference between independent proportions",
-Statistics in Medicine 17, 1998, method 10; for sums the same), so they hold near 0 and 1 as well.
+A rate has Wilson's score interval. The intervals of a difference and of a mean are built from it
+(R. Newcombe, "Interval estimation for the difference between independent proportions", Statistics
+in Medicine 17, 1998, method 10; for sums the same), so they hold near 0 and 1 as well.
 """
 
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-Z = 1.959964  # standard deviations to each side of 95 % of a normal distribution
+Z = 1.959964  # standard deviations, half the central 95 % of a normal distribution
 
 
 class Rate(NamedTuple):
-    """A share, between 0 and 1, or a difference of two, with its interval."""
+    """A share between 0 and 1, or a difference of two, with its interval."""
 
     value: float
     low: float
@@ -21,18 +21,18 @@ class Rate(NamedTuple):
 
 
 def wilson(successes: int, trials: int) -> Rate:
-    """Return the share of successes; without trials anything is possible."""
+    """Compute the share of successes; without trials it is nan, in an interval from 0 to 1."""
     if trials == 0:
         return Rate(math.nan, 0.0, 1.0)
     share, extra = successes / trials, Z * Z / trials
     middle = (share + extra / 2.0) / (1.0 + extra)
     half = Z * math.sqrt(share * (1.0 - share) / trials + extra / (4.0 * trials)) / (1.0 + extra)
-    low, high = max(0.0, middle - half), min(1.0, middle + half)  # 0 and 1 without a rounding error
+    low, high = max(0.0, middle - half), min(1.0, middle + half)  # exact at 0 and 1
     return Rate(share, low if successes else 0.0, high if successes < trials else 1.0)
 
 
 def difference(a: Rate, b: Rate) -> Rate:
-    """Return a - b of two independent rates; it is significant where 0 lies outside."""
+    """Compute a - b of two independent rates; it is significant if its interval excludes 0."""
     value = a.value - b.value
     return Rate(
         value,
@@ -42,7 +42,7 @@ def difference(a: Rate, b: Rate) -> Rate:
 
 
 def mean(rates: Sequence[Rate]) -> Rate:
-    """Return the plain mean of independent rates."""
+    """Compute the unweighted mean of independent rates."""
     value = sum(rate.value for rate in rates) / len(rates)
     return Rate(
         value,
@@ -52,5 +52,5 @@ def mean(rates: Sequence[Rate]) -> Rate:
 
 
 def is_significant(gap: Rate) -> bool:
-    """Return whether a difference is none of chance's."""
+    """Check whether the interval of a difference excludes zero."""
     return not gap.low <= 0.0 <= gap.high

@@ -1,25 +1,25 @@
-"""The paper's own figures (Sec. III), to stand beside ours, and how its derived ones are made.
+"""The paper's published results (Sec. III), and the formulas of its derived values.
 
-Success is in percent of `TRIALS` trials a cell, sizes are in terrains/*.toml.
+Success is in percent of `TRIALS` trials per cell; obstacle sizes are in terrains/*.toml.
 """
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
-TRIALS = 2000  # a cell; of stairs one half goes up and one half down
+TRIALS = 2000  # per cell; half of those on stairs go up, half down
 KINDS = ("stairs", "gap", "platform")
-LEVELS = ("easy", "medium", "hard", "ood")  # the last one is outside of training
-ROUNDING = 0.01  # points; a printed value that is further off is no rounding
+LEVELS = ("easy", "medium", "hard", "ood")  # the last is outside the training range
+ROUNDING = 0.01  # percentage points; a larger difference is not due to rounding
 
 Cell = tuple[str, str]  # kind, level
 
 
 class Method(NamedTuple):
-    """A row of Table II and of Table III."""
+    """A row of Tables II and III."""
 
     success: dict[Cell, float]  # %, Table II
-    up: dict[str, int]  # failures on the way up at each level, Table III
-    down: dict[str, int]  # failures on the way down at each level, Table III
+    up: dict[str, int]  # failures going up, by level, Table III
+    down: dict[str, int]  # failures going down, by level, Table III
     scenes: int  # of 20 in MuJoCo, Table II
     overall: float  # %, as printed in Table II
 
@@ -63,18 +63,18 @@ METHODS = {
 
 
 def overall(success: Mapping[Cell, float]) -> float:
-    """Return the plain mean of the twelve cells, those outside of training included."""
+    """Compute the unweighted mean of the twelve cells, including those outside training."""
     return sum(success[kind, level] for kind in KINDS for level in LEVELS) / 12.0
 
 
 def stair_success(up: int, down: int, trials: int = TRIALS) -> float:
-    """Return the success on stairs, %, from the failures on the way up and on the way down."""
+    """Compute the success on stairs, %, from the failures going up and going down."""
     return 100.0 * (1.0 - (up + down) / trials)
 
 
-def misprints() -> dict[str, tuple[float, float]]:
-    """Return the derived values that are printed otherwise: (printed, recomputed), %."""
-    found = {}
+def find_misprints() -> dict[str, tuple[float, float]]:
+    """Find derived values that differ from those printed: (printed, recomputed), %."""
+    misprints = {}
     for name, method in METHODS.items():
         derived = {f"{name}, overall": (method.overall, overall(method.success))}
         for level in LEVELS:
@@ -83,5 +83,5 @@ def misprints() -> dict[str, tuple[float, float]]:
                 stair_success(method.up[level], method.down[level]),
             )
         wrong = lambda pair: abs(pair[0] - pair[1]) > ROUNDING
-        found |= {title: pair for title, pair in derived.items() if wrong(pair)}
-    return found
+        misprints |= {title: pair for title, pair in derived.items() if wrong(pair)}
+    return misprints

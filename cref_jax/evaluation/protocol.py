@@ -1,4 +1,4 @@
-"""The rules of evaluation: commands, times, lanes, and what is switched off."""
+"""The evaluation protocol: commands, time limits, lanes, and settings switched off."""
 
 import dataclasses
 
@@ -7,13 +7,13 @@ import jax
 from cref_jax.config import Config
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
-SECONDS = 20.0  # of an episode on flat ground; assumed
-TRIAL_SECONDS = 40.0  # at most, of a trial on a lane, Sec. III-A
-LANE_SEEDS = tuple(range(1001, 1006))  # of the lanes of trials: others than those of training
+SECONDS = 20.0  # per episode on flat ground; assumed
+TRIAL_SECONDS = 40.0  # time limit of a trial on a lane, Sec. III-A
+LANE_SEEDS = tuple(range(1001, 1006))  # of trial lanes; not used in training
 
 
 def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
-    """Return the configuration to judge in: nothing randomised, forward commands, heading held."""
+    """Build the evaluation settings: nothing randomised, forward commands, heading held."""
     return dataclasses.replace(
         c,
         randomisation=dataclasses.replace(c.randomisation, enabled=False),
@@ -30,9 +30,9 @@ def evaluation_config(c: Config, seconds: float = SECONDS) -> Config:
 
 
 def trial_config(c: Config) -> Config:
-    """Return the configuration of trials: that of evaluation, without what training alone needs.
+    """Build the settings of trials: those of evaluation, with training-only settings at defaults.
 
-    So policies of one network share one compiled program.
+    Policies of one network thus share one compiled program.
     """
     base = Config()
     c = dataclasses.replace(c, run=base.run, ppo=base.ppo, curriculum=base.curriculum)
@@ -41,5 +41,5 @@ def trial_config(c: Config) -> Config:
 
 
 def robots_per_block() -> int:
-    """Return how many robots a device steps together in trials; assumed: fills it."""
+    """Return the number of robots per device in trials; assumed: fills it."""
     return 100 if jax.default_backend() == "cpu" else 1000

@@ -1,6 +1,6 @@
 """Success with everything randomised, and with each part of the randomisation alone.
 
-What is drawn for a trial comes from the seed and the trial's number, like its start and command.
+A trial's draws depend on the seed and the trial's number, like its start and command.
 """
 
 import dataclasses
@@ -23,21 +23,21 @@ EVERYTHING = "everything"
 PARTS = Spread._fields
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper_results.LEVELS, BEYOND)
-BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs of that are not asked
+BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs are not tested there
 LANES = tables.LANES | {"flat": ("flat",)}
 ALONE = (("flat", "easy"), ("stairs", "medium"), ("gap", "medium"), ("platform", "medium"))
 
 
 class Row(NamedTuple):
-    """A cell, and what is randomised in it."""
+    """A cell and the part that is randomised in it."""
 
     part: str  # one of PARTS, or EVERYTHING
     kind: str
     level: str
 
 
-def rows() -> list[Row]:
-    """Return every row: the cells with everything, then each part alone on a cell of each kind."""
+def list_rows() -> list[Row]:
+    """List all rows: the cells with everything, then each part alone on one cell per kind."""
     cells = [
         *paper_results.METHODS[paper_results.FULL].success,
         ("gap", BEYOND),
@@ -47,17 +47,21 @@ def rows() -> list[Row]:
     return whole + [Row(part, *cell) for part in PARTS for cell in ALONE]
 
 
-def size(kind: str, level: str) -> float:
-    """Return the size of the obstacles, m; 0 on flat ground."""
+def obstacle_size(kind: str, level: str) -> float:
+    """Return the obstacle size, m; 0 on flat ground."""
     if kind == "flat":
         return 0.0
     return BEYOND_SIZES[kind] if level == BEYOND else tables.cell_sizes()[kind][level]
 
 
-def world(c: Config, physics: Physics) -> World:
-    """Return the world with the lanes of all rows and the project's own ranges of randomisation."""
-    sized = {lane: [size(kind, at) for at in LEVELS] for kind, of in LANES.items() for lane in of}
-    w = tables.world_of(c, physics, sized)
+def row_world(c: Config, physics: Physics) -> World:
+    """Build the world with the lanes of all rows and the default ranges of randomisation."""
+    sized = {
+        lane: [obstacle_size(kind, at) for at in LEVELS]
+        for kind, of in LANES.items()
+        for lane in of
+    }
+    w = tables.make_lane_world(c, physics, sized)
     return w.replace(config=dataclasses.replace(w.config, randomisation=config.Randomisation()))
 
 
@@ -66,29 +70,31 @@ def run_rows(
     train: ppo.TrainState,
     count: int,
     seed: int,
-    ended: Callable[[int], None] = lambda count: None,
-    asked: Sequence[Row] | None = None,
+    on_finished: Callable[[int], None] = lambda count: None,
+    selected: Sequence[Row] | None = None,
 ) -> list[dict[str, Any]]:
-    """Return what a policy makes of `count` trials of each row; `ended` is told of each end."""
-    every = list(asked or rows())
+    """Run `count` trials per row; `on_finished(n)` is called as trials end."""
+    every = list(selected or list_rows())
     on = [
         tables.round_robin_lanes(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
         for row in every
     ]
     kind, level = map(np.concatenate, zip(*on, strict=True))
     spread = jax.tree.map(lambda *x: np.repeat(x, count), *(_spread(row.part) for row in every))
-    # the same start, command and draws on a lane, whatever is randomised there
+    # same start, command and draws on a lane, whichever parts are randomised
     number = np.tile(np.arange(count), len(every))
-    wanted = trials.Asked(number, kind, level, spread)
-    made = trials.run(w, trials.follow(train), wanted, seed, protocol.robots_per_block(), ended)
-    part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in made))
-    return [_outcome(row, part(k)) for k, row in enumerate(every)]
+    specs = trials.TrialSpecs(number, kind, level, spread)
+    outcomes = trials.run(
+        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
+    )
+    part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in outcomes))
+    return [_row_result(row, part(k)) for k, row in enumerate(every)]
 
 
-def overall(found: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return the means of the paper's cells, with everything randomised."""
+def overall(results: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Compute the mean success over the paper's cells, with everything randomised."""
     cells = [
-        row for row in found if row["part"] == EVERYTHING and row["level"] in paper_results.LEVELS
+        row for row in results if row["part"] == EVERYTHING and row["level"] in paper_results.LEVELS
     ]
     rate = lambda some: intervals.mean(
         [intervals.wilson(row["successes"], row["trials"]) for row in some]
@@ -103,30 +109,30 @@ def overall(found: Sequence[dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def text(found: Sequence[dict[str, Any]]) -> Table:
-    """Return the cells with everything randomised for the terminal, in percent."""
+def to_table(results: Sequence[dict[str, Any]]) -> Table:
+    """Build the table of the cells with everything randomised, in percent."""
     shown = Table(box=None, padding=(0, 1))
     shown.add_column("success, everything randomised, %", no_wrap=True)
     for title in ("trials", "ours", "95 %"):
         shown.add_column(title, justify="right", no_wrap=True)
-    whole = overall(found)
-    for row in (row for row in found if row["part"] == EVERYTHING):
+    whole = overall(results)
+    for row in (row for row in results if row["part"] == EVERYTHING):
         name = f"{row['kind']} {100 * row['size_m']:.0f} cm"
-        shown.add_row(name, str(row["trials"]), f"{100 * row['rate']:.1f}", _interval(row))
-    shown.add_row("all twelve", "", f"{100 * whole['rate']:.1f}", _interval(whole))
+        shown.add_row(name, str(row["trials"]), f"{100 * row['rate']:.1f}", _interval_text(row))
+    shown.add_row("all twelve", "", f"{100 * whole['rate']:.1f}", _interval_text(whole))
     shown.add_row("nine trained", "", f"{100 * whole['trained']:.1f}", "")
     return shown
 
 
-def alone(found: Sequence[dict[str, Any]]) -> Table:
-    """Return what each part does alone for the terminal, in percent."""
+def parts_table(results: Sequence[dict[str, Any]]) -> Table:
+    """Build the table of success with each part alone, in percent."""
     shown = Table(box=None, padding=(0, 1))
     shown.add_column("success with one part alone, %", no_wrap=True)
     for kind, level in ALONE:
-        name = kind if kind == "flat" else f"{kind} {100 * size(kind, level):.0f} cm"
+        name = kind if kind == "flat" else f"{kind} {100 * obstacle_size(kind, level):.0f} cm"
         shown.add_column(name, justify="right", no_wrap=True)
     for part in PARTS:
-        rates = [f"{100 * row['rate']:.0f}" for row in found if row["part"] == part]
+        rates = [f"{100 * row['rate']:.0f}" for row in results if row["part"] == part]
         shown.add_row(part, *rates)
     return shown
 
@@ -137,20 +143,20 @@ def _spread(part: str) -> Spread:
     return Spread(*(np.float32(name == part) for name in PARTS))
 
 
-def _outcome(row: Row, made: Trials) -> dict[str, Any]:
-    rate = intervals.wilson(int(made.succeeded.sum()), len(made.succeeded))
+def _row_result(row: Row, outcomes: Trials) -> dict[str, Any]:
+    rate = intervals.wilson(int(outcomes.succeeded.sum()), len(outcomes.succeeded))
     return {
         **row._asdict(),
-        "size_m": size(row.kind, row.level),
-        "trials": len(made.succeeded),
-        "successes": int(made.succeeded.sum()),
+        "size_m": obstacle_size(row.kind, row.level),
+        "trials": len(outcomes.succeeded),
+        "successes": int(outcomes.succeeded.sum()),
         "rate": rate.value,
         "wilson_low": rate.low,
         "wilson_high": rate.high,
-        "failures": made.failures(),
-        "sideways": lateral_drift.summarize(made.drift, made.aside),
+        "failures": outcomes.failures(),
+        "sideways": lateral_drift.summarize(outcomes.drift, outcomes.aside),
     }
 
 
-def _interval(of: dict[str, Any]) -> str:
+def _interval_text(of: dict[str, Any]) -> str:
     return f"{100 * of['wilson_low']:.0f}-{100 * of['wilson_high']:.0f}"

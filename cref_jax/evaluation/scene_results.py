@@ -1,4 +1,4 @@
-"""What the trials in the scenes come to: the records, how they are counted, and their tables."""
+"""Results of the trials in the scenes: records, pass criterion and tables."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,37 +14,38 @@ from cref_jax.evaluation.intervals import wilson
 from cref_jax.evaluation.lateral_drift import summarize
 from cref_jax.whole_body.disturbances import UNDISTURBED, Disturbance
 
-PASSED = 0.5  # share of a scene's trials that must come to its end; assumed: the paper counts
-# scenes, and does not say what it takes
+PASSED = 0.5
+"""share of a scene's trials that must reach its end; assumed: the paper counts scenes and gives no
+criterion"""
 RULE = (
-    f"A scene is passed when at least {PASSED:.0%} of its trials come to its end within 40 s, "
+    f"A scene is passed when at least {PASSED:.0%} of its trials reach its end within 40 s, "
     "without a fall, a step off the path or a stall (less than 0.3 of the commanded distance over "
     "10 s)."
 )
 
 
 class Condition(NamedTuple):
-    """What the trials are run under."""
+    """Conditions under which trials are run."""
 
     name: str
     disturbance: Disturbance = UNDISTURBED
     friction: float = robot.FRICTION
 
 
-class Outcome(NamedTuple):
-    """What a trial is counted by; see stand_in.Trial."""
+class TrialOutcome(NamedTuple):
+    """Measures by which a trial is counted; see whole_body.trial.Trial."""
 
     ending: str
     seconds: float
     progress: float  # m
     speed: float  # m/s
     status: Status
-    drift: float  # m, see lateral_drift.spans
+    drift: float  # m, see lateral_drift.measure
     aside: float  # m
 
 
 class SceneResult(NamedTuple):
-    """The outcome of the undisturbed trials in one scene."""
+    """Outcome of the undisturbed trials in one scene."""
 
     name: str
     title: str
@@ -60,7 +61,7 @@ class SceneResult(NamedTuple):
 
 
 class ConditionResult(NamedTuple):
-    """The outcome of the trials in all scenes under one condition."""
+    """Outcome of the trials in all scenes under one condition."""
 
     name: str
     dropped: float  # share of frames
@@ -78,19 +79,19 @@ class ConditionResult(NamedTuple):
     wilson_high: float
     by_scene: dict[str, int]  # successes
     passed: int  # scenes
-    said: dict[str, int]  # trials in which the policy noticed this
+    said: dict[str, int]  # trials in which the policy raised each status flag
 
 
 class Verdict(NamedTuple):
-    """Everything that was measured."""
+    """All results of the suite."""
 
-    rule: str  # how trials and scenes are counted
+    rule: str  # pass criterion
     passed: int  # scenes
     scenes: tuple[SceneResult, ...]
     conditions: tuple[ConditionResult, ...]  # the undisturbed one first
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what JSON can hold."""
+        """Convert the records to JSON types."""
         return {
             **self._asdict(),
             "scenes": [result._asdict() for result in self.scenes],
@@ -98,33 +99,35 @@ class Verdict(NamedTuple):
         }
 
 
-def verdict(titles: dict[str, str], table: dict[Condition, dict[str, list[Outcome]]]) -> Verdict:
-    """Return what all trials come to.
+def build_verdict(
+    titles: dict[str, str], table: dict[Condition, dict[str, list[TrialOutcome]]]
+) -> Verdict:
+    """Summarize all trials.
 
     Args:
-        titles: of the scenes, by their names.
-        table: outcomes by condition, the undisturbed one first, and by scene.
+        titles: of the scenes, by name.
+        table: outcomes by condition, the undisturbed one first, then by scene.
     """
     undisturbed = next(iter(table.values()))
-    each = [scene_result(name, titles[name], found) for name, found in undisturbed.items()]
+    each = [summarize_scene(name, titles[name], outcomes) for name, outcomes in undisturbed.items()]
     return Verdict(
         rule=RULE,
         passed=sum(result.passed for result in each),
         scenes=tuple(each),
-        conditions=tuple(condition_result(*row) for row in table.items()),
+        conditions=tuple(summarize_condition(*row) for row in table.items()),
     )
 
 
-def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneResult:
-    """Return what the undisturbed trials in one scene come to."""
-    rate = wilson(successes(outcomes), len(outcomes))
+def summarize_scene(name: str, title: str, outcomes: Sequence[TrialOutcome]) -> SceneResult:
+    """Summarize the undisturbed trials in one scene."""
+    rate = wilson(count_successes(outcomes), len(outcomes))
     seconds = [o.seconds for o in outcomes if o.ending == "finished"]
     return SceneResult(
         name=name,
         title=title,
         trials=len(outcomes),
-        successes=successes(outcomes),
-        failures=by_cause(outcomes),
+        successes=count_successes(outcomes),
+        failures=count_causes(outcomes),
         rate=rate.value,
         wilson_low=rate.low,
         wilson_high=rate.high,
@@ -136,11 +139,13 @@ def scene_result(name: str, title: str, outcomes: Sequence[Outcome]) -> SceneRes
     )
 
 
-def condition_result(condition: Condition, by_scene: dict[str, list[Outcome]]) -> ConditionResult:
-    """Return what the trials in all scenes under one condition come to."""
+def summarize_condition(
+    condition: Condition, by_scene: dict[str, list[TrialOutcome]]
+) -> ConditionResult:
+    """Summarize the trials in all scenes under one condition."""
     every = [outcome for outcomes in by_scene.values() for outcome in outcomes]
-    rate = wilson(successes(every), len(every))
-    said = Counter(flag.name for o in every for flag in Status if flag & o.status)
+    rate = wilson(count_successes(every), len(every))
+    raised = Counter(flag.name for o in every for flag in Status if flag & o.status)
     return ConditionResult(
         name=condition.name,
         dropped=condition.disturbance.dropped,
@@ -151,58 +156,58 @@ def condition_result(condition: Condition, by_scene: dict[str, list[Outcome]]) -
         dead=condition.disturbance.dead,
         friction=condition.friction,
         trials=len(every),
-        successes=successes(every),
-        failures=by_cause(every),
+        successes=count_successes(every),
+        failures=count_causes(every),
         rate=rate.value,
         wilson_low=rate.low,
         wilson_high=rate.high,
-        by_scene={name: successes(outcomes) for name, outcomes in by_scene.items()},
+        by_scene={name: count_successes(outcomes) for name, outcomes in by_scene.items()},
         passed=sum(is_passed(outcomes) for outcomes in by_scene.values()),
-        said={str(name): count for name, count in said.items()},
+        said={str(name): count for name, count in raised.items()},
     )
 
 
-def successes(outcomes: Sequence[Outcome]) -> int:
-    """Return how many came to the end."""
+def count_successes(outcomes: Sequence[TrialOutcome]) -> int:
+    """Count the trials that reached the end."""
     return sum(o.ending == "finished" for o in outcomes)
 
 
-def by_cause(outcomes: Sequence[Outcome]) -> dict[str, int]:
-    """Return how many failed for each cause, the most frequent first."""
+def count_causes(outcomes: Sequence[TrialOutcome]) -> dict[str, int]:
+    """Count the failures by cause, the most frequent first."""
     return dict(Counter(o.ending for o in outcomes if o.ending != "finished").most_common())
 
 
-def is_passed(outcomes: Sequence[Outcome]) -> bool:
-    """Return whether a scene counts as passed, by `RULE`."""
-    return successes(outcomes) >= PASSED * len(outcomes)
+def is_passed(outcomes: Sequence[TrialOutcome]) -> bool:
+    """Check whether a scene is passed, by `RULE`."""
+    return count_successes(outcomes) >= PASSED * len(outcomes)
 
 
-def show(verdict: Verdict, console: Console) -> None:
+def print_tables(verdict: Verdict, console: Console) -> None:
     """Print the verdict as two tables."""
     by_scene = Table(title=f"{verdict.passed} of {len(verdict.scenes)} scenes passed")
-    for column in ("scene", "trials", "to the end", "95 %", "failures"):
+    for column in ("scene", "trials", "successes", "95 %", "failures"):
         by_scene.add_column(column, justify="left" if column in ("scene", "failures") else "right")
     for r in verdict.scenes:
         by_scene.add_row(
-            r.title, str(r.trials), str(r.successes), _interval(r), _causes(r.failures),
+            r.title, str(r.trials), str(r.successes), _interval_text(r), _causes_text(r.failures),
             style="green" if r.passed else "",
         )  # fmt: skip
     console.print(by_scene)
     by_condition = Table(title="the same scenes under conditions")
-    for column in ("condition", "trials", "to the end", "95 %", "scenes passed", "failures"):
+    for column in ("condition", "trials", "successes", "95 %", "scenes passed", "failures"):
         left = column in ("condition", "failures")
         by_condition.add_column(column, justify="left" if left else "right")
     for r in verdict.conditions:
         by_condition.add_row(
-            r.name, str(r.trials), str(r.successes), _interval(r), str(r.passed),
-            _causes(r.failures),
+            r.name, str(r.trials), str(r.successes), _interval_text(r), str(r.passed),
+            _causes_text(r.failures),
         )  # fmt: skip
     console.print(by_condition)
 
 
-def _interval(result: SceneResult | ConditionResult) -> str:
+def _interval_text(result: SceneResult | ConditionResult) -> str:
     return f"{result.wilson_low:.0%} to {result.wilson_high:.0%}"
 
 
-def _causes(causes: dict[str, int]) -> str:
+def _causes_text(causes: dict[str, int]) -> str:
     return ", ".join(f"{count} {cause}" for cause, count in causes.items())

@@ -1,8 +1,8 @@
-"""Success of an exported policy in scenes that it was not trained on, with good and bad frames.
+"""Success of an exported policy in scenes outside its training, with good and bad frames.
 
-The policy runs by numpy alone on the whole robot. Every trial is drawn from the seed, the scene's
-name and its own number, so that it is the same whatever else is asked for, and the same under every
-condition: two conditions differ in nothing but what they do.
+The policy runs in numpy alone on the whole robot. Each trial is drawn from the seed, the scene's
+name and its own number, so it does not depend on the other trials and is the same under every
+condition: two conditions differ only in what they change.
 """
 
 import cref_jax.system.startup  # noqa: F401
@@ -22,7 +22,7 @@ from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import lateral_drift, protocol, scene_results
 from cref_jax.evaluation.protocol import COMMANDS, TRIAL_SECONDS
-from cref_jax.evaluation.scene_results import Condition, Outcome, Verdict
+from cref_jax.evaluation.scene_results import Condition, TrialOutcome, Verdict
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
 from cref_jax.rendering.video import write_video
@@ -36,8 +36,8 @@ from cref_jax.whole_body.trial import Start, Trial, run_trial
 START_X, START_Y = (0.5, 1.0), (-0.3, 0.3)  # m; assumed: as in training
 START_YAW = (-0.2, 0.2)  # rad; assumed
 FRAME_RATE = 25.0  # 1/s, of a film
-SIZE = (960, 540)  # pixels of it
-VIEW = (12.0, -24.0)  # deg, azimuth and elevation: from behind, so that no wall is in the way
+SIZE = (960, 540)  # pixels, of a film
+VIEW = (12.0, -24.0)  # deg, azimuth and elevation: from behind, so no wall is in the way
 
 GOOD = Condition("undisturbed")
 CONDITIONS = (
@@ -71,44 +71,44 @@ def run_scenes(
     scenes: Mapping[str, Scene] | None = None,
     workers: int | None = None,
 ) -> Verdict:
-    """Return how the policy does in all scenes, undisturbed and under each condition.
+    """Evaluate the policy in all scenes, undisturbed and under each condition.
 
     Args:
-        policy: what `export` wrote, or its .zip; the bundled one when left out.
-        trials: of each scene, undisturbed.
-        stress_trials: of each scene under each of CONDITIONS; none of them with 0.
+        policy: directory or .zip written by `export` (default: the bundled policy).
+        trials: per scene, undisturbed.
+        stress_trials: per scene and condition in CONDITIONS; 0 skips the conditions.
         seed: of starts, commands and disturbances.
-        seconds: of a trial, at most.
-        scenes: to judge in; those of `terrains/ood` when left out.
-        workers: how many trials at a time; one a core when left out.
+        seconds: time limit of a trial.
+        scenes: to evaluate (default: those of `terrains/ood`).
+        workers: trials run in parallel (default: one per core).
 
     Raises:
-        ConfigError: a number of trials or the seed cannot be, or there is no such policy.
+        ConfigError: a number of trials or the seed is out of range, or the policy does not exist.
     """
     if trials < 1 or stress_trials < 0 or seed < 0:
         raise ConfigError(
             "trials must be at least 1, stress trials and seed at least 0, not "
             f"{trials}, {stress_trials} and {seed}"
         )
-    path, found = policy or sources.bundled_policy(), dict(scenes or scene_files.scenes())
-    arguments = (path, found, seed, seconds)
-    _Runner(*arguments)  # refuses what is no policy before any process is started
+    path, grounds = policy or sources.bundled_policy(), dict(scenes or scene_files.load_all())
+    arguments = (path, grounds, seed, seconds)
+    _Runner(*arguments)  # reject an invalid policy before starting processes
     conditions = (GOOD, *(CONDITIONS if stress_trials else ()))
     jobs = [
         _Job(name, number, condition)
         for condition in conditions
-        for name in found
+        for name in grounds
         for number in range(trials if condition is GOOD else stress_trials)
     ]
-    table = {condition: {name: [] for name in found} for condition in conditions}
+    table = {condition: {name: [] for name in grounds} for condition in conditions}
     outcomes = parallel.run(_Runner, arguments, jobs, workers)
     for job, outcome in zip(jobs, outcomes, strict=True):
         table[job.condition][job.scene].append(outcome)
-    titles = {name: ground.title for name, ground in found.items()}
-    return scene_results.verdict(titles, table)
+    titles = {name: ground.title for name, ground in grounds.items()}
+    return scene_results.build_verdict(titles, table)
 
 
-def film(
+def film_trial(
     policy: Path | None,
     name: str,
     out: Path,
@@ -117,18 +117,18 @@ def film(
     number: int = 0,
     friction: float = robot.FRICTION,
 ) -> Trial:
-    """Write an .mp4 of one of `judge`'s trials in the scene of this name, and return the trial.
+    """Write an .mp4 of one of `run_scenes`' trials in the named scene, and return the trial.
 
     Raises:
         ConfigError: no such scene or policy, no OpenGL, or the file cannot be written.
     """
     if out.suffix != ".mp4":
         raise ConfigError(f"a film must end in .mp4: {out}")
-    ground = scene_files.named(name)
+    ground = scene_files.load_named(name)
     runner = _Runner(policy or sources.bundled_policy(), {name: ground}, seed, TRIAL_SECONDS)
     trial = runner.trial(_Job(name, number, Condition("filmed", disturbance, friction)))
-    physics, name = runner.config.physics, runner.config.robot.name
-    spec = robot_scene.stage("all", physics, -scene_files.DITCH - robot_scene.BASE, name)
+    physics, z = runner.config.physics, -scene_files.DITCH - robot_scene.BASE
+    spec = robot_scene.build_stage("all", physics, z, runner.config.robot.name)
     ground.add_to(spec, friction)
     stride = max(1, round(1.0 / (FRAME_RATE * physics.control_period)))
     points = robot_scene.camera_path(trial.qpos, physics.control_period)
@@ -139,52 +139,54 @@ def film(
     return trial
 
 
-def start(body: WholeBodySim, name: str, seed: int, number: int) -> Start:
-    """Return how the trial of this number begins in the scene of this name."""
+def sample_start(body: WholeBodySim, name: str, seed: int, number: int) -> Start:
+    """Sample the start of trial `number` in the named scene."""
     rng = _rng(name, seed, number)
     x, y, yaw, speed = (
         float(rng.uniform(*limits)) for limits in (START_X, START_Y, START_YAW, COMMANDS)
     )
-    turned = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
-    base = np.array([x, y, body.robot.standing_height, *turned])
+    quaternion = [math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)]
+    base = np.array([x, y, body.robot.standing_height, *quaternion])
     return Start(base, body.robot.nominal_pose[body.driven], speed)
 
 
 class _Runner:
-    """Runs trials of one policy; keeps what several of them need."""
+    """Runner of one policy's trials; caches the compiled scenes."""
 
     def __init__(self, path: Path, scenes: Mapping[str, Scene], seed: int, seconds: float) -> None:
         if sources.is_run(path):
-            raise ConfigError(f"{path} is no exported policy; make one: python -m cref_jax.export")
+            raise ConfigError(
+                f"{path} is not an exported policy; write one: python -m cref_jax.export"
+            )
         self.config: Config = protocol.evaluation_config(sources.read_config(path), seconds)
         self._contents = deploy.contents(path)
         self._scenes, self._seed, self._seconds = scenes, seed, seconds
-        self._body = functools.cache(self._compiled)
+        self._body = functools.cache(self._build_body)
 
     def policy(self) -> deploy.Policy:
-        """Return the policy, reset."""
+        """Create the policy in its reset state."""
         return deploy.Policy(*self._contents)
 
-    def __call__(self, job: _Job) -> Outcome:
-        """Return what a trial is counted by."""
+    def __call__(self, job: _Job) -> TrialOutcome:
+        """Run a trial and return the measures by which it is counted."""
         t = self.trial(job)
-        drift, aside = lateral_drift.spans(t.qpos[:, 1:2])
-        return Outcome(
+        drift, aside = lateral_drift.measure(t.qpos[:, 1:2])
+        return TrialOutcome(
             t.ending, t.seconds, t.progress, t.speed, t.status, float(drift[0]), float(aside[0])
         )
 
     def trial(self, job: _Job) -> Trial:
-        """Return the trial."""
+        """Run a trial."""
         body = self._body(job.scene, job.condition.friction)
-        begun = start(body, job.scene, self._seed, job.number)
-        fate = int(_rng(job.scene, self._seed, job.number, 1).integers(2**32))
-        disturbance = job.condition.disturbance._replace(seed=fate)
-        return run_trial(body, self.policy(), begun, self._seconds, disturbance)
+        start = sample_start(body, job.scene, self._seed, job.number)
+        disturbance_seed = int(_rng(job.scene, self._seed, job.number, 1).integers(2**32))
+        disturbance = job.condition.disturbance._replace(seed=disturbance_seed)
+        return run_trial(body, self.policy(), start, self._seconds, disturbance)
 
-    def _compiled(self, name: str, friction: float) -> WholeBodySim:
+    def _build_body(self, name: str, friction: float) -> WholeBodySim:
         return WholeBodySim(self.config, self._scenes[name], self.policy().joints.names, friction)
 
 
-def _rng(name: str, seed: int, number: int, what: int = 0) -> np.random.Generator:
-    """Return the generator of a trial; `what` is 0 for its start, 1 for its disturbance."""
-    return np.random.default_rng([seed, zlib.crc32(name.encode()), number, what])
+def _rng(name: str, seed: int, number: int, stream: int = 0) -> np.random.Generator:
+    """Create a trial's generator; `stream` is 0 for its start, 1 for its disturbance."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode()), number, stream])

@@ -1,7 +1,7 @@
-"""Tables II and III: twelve cells of success, the failures on stairs, the paper's figures beside.
+"""Tables II and III: success in twelve cells and failures on stairs, beside the paper's results.
 
-A trial of a cell of stairs is one flight, up and down in turn, so that the failures of both
-directions add up to those of the cell, as they do in the paper.
+A trial on stairs is one flight, alternately up and down, so the failures of both directions add up
+to those of the cell, as in the paper.
 """
 
 import itertools
@@ -24,51 +24,55 @@ from cref_jax.terrain import lanes
 
 LANES = {"stairs": ("ascent", "descent"), "gap": ("gap",), "platform": ("platform",)}
 UP, DOWN = 0, 1  # in LANES["stairs"]
-SPEEDS = (0.4, 0.5, 0.6, 0.7, 0.8)  # m/s, edges of the groups of commands
+SPEEDS = (0.4, 0.5, 0.6, 0.7, 0.8)  # m/s, edges of the groups of commanded speeds
 RULE = (
-    "A trial is won at the lane's end, within 40 s, and lost where the robot falls, stalls (less "
-    "than 0.3 of the commanded distance over 10 s) or is late. Commands: 0.4 to 0.8 m/s forward."
+    "A trial succeeds if the robot reaches the lane's end within 40 s, and fails if it falls, "
+    "stalls (less than 0.3 of the commanded distance over 10 s) or is late. Commands: 0.4 to 0.8 "
+    "m/s forward."
 )
 
 
 class Lanes(NamedTuple):
-    """On which lane of the world each of N trials is made."""
+    """Lanes of N trials in the world."""
 
     kind: Int[np.ndarray, " N"]
     level: Int[np.ndarray, " N"]
 
 
-class Outcomes(NamedTuple):
-    """The trials of one policy in one cell."""
+class CellOutcomes(NamedTuple):
+    """Trials of one policy in one cell."""
 
     trials: Trials
-    is_down: Bool[np.ndarray, " N"]  # a flight of stairs down; never true elsewhere
+    is_down: Bool[np.ndarray, " N"]  # down a flight of stairs; false elsewhere
 
 
 def cell_sizes() -> dict[str, dict[str, float]]:
-    """Return the size of each kind's obstacles at each level, m."""
+    """Return the obstacle size of each kind at each level, m."""
     return {kind: lanes.named_sizes(config.Terrain(), of[0]) for kind, of in LANES.items()}
 
 
-def world(c: Config, physics: Physics) -> World:
-    """Return the world with the lanes of all cells."""
+def cell_world(c: Config, physics: Physics) -> World:
+    """Build the world with the lanes of all cells."""
     sized = {lane: tuple(cell_sizes()[kind].values()) for kind, of in LANES.items() for lane in of}
-    return world_of(c, physics, sized)
+    return make_lane_world(c, physics, sized)
 
 
-def world_of(c: Config, physics: Physics, sized: Mapping[str, Sequence[float]]) -> World:
-    """Return the world of trials on lanes with obstacles of these sizes of each kind, m."""
-    atlas = lanes.grid(config.Terrain(cell=c.terrain.cell), sized, protocol.LANE_SEEDS)
+def make_lane_world(c: Config, physics: Physics, sized: Mapping[str, Sequence[float]]) -> World:
+    """Build the world of trials on lanes with these obstacle sizes of each kind, m."""
+    atlas = lanes.build_grid(config.Terrain(cell=c.terrain.cell), sized, protocol.LANE_SEEDS)
     return make_world(protocol.trial_config(c), physics).replace(lanes=atlas)
 
 
-def lanes_of(cell: Cell, count: int, kinds: Sequence[str]) -> Lanes:
-    """Return the lanes of so many trials of a cell: kinds and seeds in turn."""
+def cell_lanes(cell: Cell, count: int, kinds: Sequence[str]) -> Lanes:
+    """Return the lanes of `count` trials of a cell, round-robin over kinds and seeds."""
     return round_robin_lanes(LANES[cell[0]], paper_results.LEVELS.index(cell[1]), count, kinds)
 
 
 def round_robin_lanes(names: Sequence[str], level: int, count: int, kinds: Sequence[str]) -> Lanes:
-    """Return so many lanes of these names and this level, of a world's kinds and seeds in turn."""
+    """Return `count` lanes of one level, round-robin over the named kinds, then over seeds.
+
+    `kinds` are those of the world, in its order.
+    """
     number, variants = np.arange(count), len(protocol.LANE_SEEDS)
     of = np.array([kinds.index(lane) for lane in names])
     first = level * variants
@@ -80,29 +84,31 @@ def run_cells(
     train: ppo.TrainState,
     count: int,
     seed: int,
-    ended: Callable[[int], None] = lambda count: None,
-) -> dict[Cell, Outcomes]:
-    """Return what a policy makes of `count` trials of each cell; `ended` is told of each end."""
+    on_finished: Callable[[int], None] = lambda count: None,
+) -> dict[Cell, CellOutcomes]:
+    """Run `count` trials per cell; `on_finished(n)` is called as trials end."""
     every = list(paper_results.METHODS[paper_results.FULL].success)
-    on = [lanes_of(cell, count, w.lanes.kinds) for cell in every]
+    on = [cell_lanes(cell, count, w.lanes.kinds) for cell in every]
     kind, level = map(np.concatenate, zip(*on, strict=True))
-    asked = trials.Asked(np.tile(np.arange(count), len(every)), kind, level)
-    made = trials.run(w, trials.follow(train), asked, seed, protocol.robots_per_block(), ended)
+    specs = trials.TrialSpecs(np.tile(np.arange(count), len(every)), kind, level)
+    outcomes = trials.run(
+        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
+    )
     down = kind == w.lanes.kinds.index("descent")
     part = lambda k: slice(k * count, (k + 1) * count)
     return {
-        cell: Outcomes(Trials(*(x[part(k)] for x in made)), down[part(k)])
+        cell: CellOutcomes(Trials(*(x[part(k)] for x in outcomes)), down[part(k)])
         for k, cell in enumerate(every)
     }
 
 
-def cells(judged: Sequence[Mapping[Cell, Outcomes]]) -> list[dict[str, Any]]:
-    """Return the rows of eval.json, the trials of several policies pooled."""
-    return [_cell(cell, [of[cell] for of in judged]) for cell in judged[0]]
+def cell_rows(policies: Sequence[Mapping[Cell, CellOutcomes]]) -> list[dict[str, Any]]:
+    """Build the rows of eval.json, pooling the trials of several policies."""
+    return [_cell_row(cell, [outcomes[cell] for outcomes in policies]) for cell in policies[0]]
 
 
 def overall(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the plain means of all cells, of those inside of training, and of the others."""
+    """Compute the unweighted means of all cells, of those inside training, and of the others."""
     ours = lambda some: intervals.mean([_rate(row) for row in some])
     theirs = lambda some: float(np.mean([row["paper"]["rate"] for row in some]))
     inside = [row for row in rows if row["level"] != "ood"]
@@ -120,8 +126,8 @@ def overall(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
-    """Return the table for the terminal, in percent."""
+def to_table(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
+    """Build the table for the terminal, in percent."""
     table = Table(box=None, padding=(0, 1))
     table.add_column("success, %", no_wrap=True)
     several = len(rows[0]["by_policy"]) > 1
@@ -133,7 +139,7 @@ def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
         table.add_row(
             f"{row['kind']} {100 * row['size_m']:.0f} cm" + " (OOD)" * (row["level"] == "ood"),
             str(row["trials"]),
-            *_beside_paper(
+            *_comparison_columns(
                 row["rate"], row["paper"]["rate"], _rate(row), row["paper"]["significant"]
             ),
             *("" if failures is None else str(failures) for failures in both_ways),
@@ -141,38 +147,40 @@ def text(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
             end_section=row["level"] == "ood",
         )
     ours = Rate(whole["rate"], whole["wilson_low"], whole["wilson_high"])
-    table.add_row("all twelve", "", *_beside_paper(whole["rate"], whole["paper"], ours))
-    table.add_row("nine trained", "", *_beside_paper(whole["trained"], whole["paper_trained"]))
-    table.add_row("three OOD", "", *_beside_paper(whole["ood"], whole["paper_ood"]))
+    table.add_row("all twelve", "", *_comparison_columns(whole["rate"], whole["paper"], ours))
+    table.add_row(
+        "nine trained", "", *_comparison_columns(whole["trained"], whole["paper_trained"])
+    )
+    table.add_row("three OOD", "", *_comparison_columns(whole["ood"], whole["paper_ood"]))
     return table
 
 
-def failures(rows: Sequence[dict[str, Any]]) -> str:
-    """Return how trials failed, in one line a kind of terrain."""
+def failure_lines(rows: Sequence[dict[str, Any]]) -> str:
+    """Describe the failures, one line per kind of terrain."""
     lines = []
     for kind in paper_results.KINDS:
         of_kind = [row["failures"] for row in rows if row["kind"] == kind]
         total = {name: sum(row[name] for row in of_kind) for name in trials.FAILURES}
-        said = ", ".join(f"{n} {name}" for name, n in total.items() if n) or "none"
-        lines.append(f"failures on {kind}: {said}")
+        counts = ", ".join(f"{n} {name}" for name, n in total.items() if n) or "none"
+        lines.append(f"failures on {kind}: {counts}")
     return "\n".join(lines)
 
 
 def interval_note(count: int) -> str:
-    """Return how sure `count` trials make a rate, in words."""
+    """Describe the width of a rate's interval for `count` trials."""
 
     def half(share: float) -> float:
         rate = intervals.wilson(round(share * count), count)
         return 50.0 * (rate.high - rate.low)
 
     return (
-        f"{count} trials a cell: 95 % intervals of +-{half(0.97):.1f} points at 97 % success, "
+        f"{count} trials per cell: 95 % intervals of +-{half(0.97):.1f} points at 97 % success, "
         f"+-{half(0.75):.1f} at 75 %, +-{half(0.5):.1f} at 50 %"
     )
 
 
-def _cell(cell: Cell, outcomes: list[Outcomes]) -> dict[str, Any]:
-    """Return one row: the trials of all policies together."""
+def _cell_row(cell: Cell, outcomes: list[CellOutcomes]) -> dict[str, Any]:
+    """Build one row from the pooled trials of all policies."""
     kind, level = cell
     all_trials = Trials(*map(np.concatenate, zip(*(o.trials for o in outcomes), strict=True)))
     lost, is_down = ~all_trials.succeeded, np.concatenate([o.is_down for o in outcomes])
@@ -190,30 +198,30 @@ def _cell(cell: Cell, outcomes: list[Outcomes]) -> dict[str, Any]:
         "up_failures": int((lost & ~is_down).sum()) if kind == "stairs" else None,
         "down_failures": int((lost & is_down).sum()) if kind == "stairs" else None,
         "failures": all_trials.failures(),
-        "by_speed": _by_speed(all_trials),
+        "by_speed": _count_by_speed(all_trials),
         "sideways": lateral_drift.summarize(all_trials.drift, all_trials.aside),
         "by_policy": by_policy,
         "spread": float(np.std(by_policy, ddof=1)) if len(by_policy) > 1 else None,
-        "paper": _beside(rate, cell),
+        "paper": _compare_with_paper(rate, cell),
     }
 
 
-def _by_speed(made: Trials) -> list[dict[str, Any]]:
-    """Return trials and successes in each group of commanded speeds."""
-    group = np.clip(np.searchsorted(SPEEDS, made.speed, side="right") - 1, 0, len(SPEEDS) - 2)
+def _count_by_speed(outcomes: Trials) -> list[dict[str, Any]]:
+    """Count trials and successes in each group of commanded speeds."""
+    group = np.clip(np.searchsorted(SPEEDS, outcomes.speed, side="right") - 1, 0, len(SPEEDS) - 2)
     return [
         {
             "low": low,
             "high": high,
             "trials": int((group == k).sum()),
-            "successes": int(made.succeeded[group == k].sum()),
+            "successes": int(outcomes.succeeded[group == k].sum()),
         }
         for k, (low, high) in enumerate(itertools.pairwise(SPEEDS))
     ]
 
 
-def _beside(ours: Rate, cell: Cell) -> dict[str, Any]:
-    """Return the paper's rate, the difference of ours from it and whether it is significant."""
+def _compare_with_paper(ours: Rate, cell: Cell) -> dict[str, Any]:
+    """Compute the paper's rate, our difference from it and its significance."""
     successes = round(
         paper_results.METHODS[paper_results.FULL].success[cell] / 100.0 * paper_results.TRIALS
     )
@@ -233,10 +241,10 @@ def _rate(row: dict[str, Any]) -> Rate:
     return Rate(row["rate"], row["wilson_low"], row["wilson_high"])
 
 
-def _beside_paper(
+def _comparison_columns(
     ours: float, theirs: float, interval: Rate | None = None, is_significant: bool = False
 ) -> list[str]:
-    """Return our rate, its interval, the paper's rate and the difference, in percent."""
+    """Format our rate, its interval, the paper's rate and the difference, in percent."""
     span = f"{100 * interval.low:.0f}-{100 * interval.high:.0f}" if interval else ""
     gap = f"{100 * (ours - theirs):+.1f} {'*' if is_significant else ' '}"
     return [f"{100 * ours:.1f}", span, f"{100 * theirs:.2f}", gap]

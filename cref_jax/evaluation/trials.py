@@ -1,9 +1,9 @@
-"""Trials: robots start anew, and each is followed until it first comes to its lane's end or fails.
+"""Trials: each robot starts anew and is followed until it first reaches its lane's end or fails.
 
-Each device steps a block of robots together, and where one has come to its end the next trial
-begins. A trial's place in a block comes from its number, so what becomes of it depends on the seed,
-on its number and on its lane alone: not on how many trials are asked for, nor on the number of
-devices. (Another size of block, as on another device, rounds matrix products otherwise.)
+Each device steps a block of robots, and where a trial ends the next one starts. A trial's slot in a
+block follows from its number, so its outcome depends only on the seed, its number and its lane, not
+on the number of trials or of devices. (Another block size, as on another device, rounds matrix
+products differently.)
 """
 
 import collections
@@ -29,27 +29,28 @@ from cref_jax.evaluation import lateral_drift
 from cref_jax.training import rollout
 from cref_jax.training.rollout import Robots
 
-FALLS = ("unstable", "tilted", "low", "hit", "dropped")  # of Ending; the first that is true counts
-FAILURES = (*FALLS, "stalled", "late")  # late: on its feet and moving, but not at the end in time
+FALLS = ("unstable", "tilted", "low", "hit", "dropped")  # of Ending; the first true one counts
+FAILURES = (*FALLS, "stalled", "late")  # late: upright and moving, but not at the end in time
 ENDINGS = ("finished", *FAILURES)
-SEED = 1_000_003  # apart from the seeds of training
-CHUNK = 50  # control steps between two looks at which have come to an end
+SEED = 1_000_003  # offset from the seeds of training
+CHUNK = 50  # control steps between checks for trials that have ended
 AXIS = "robots"  # of the mesh
 
-Walker = Callable[[World, Robots], tuple[Robots, Outcome]]  # a jax.tree_util.Partial, so no retrace
+# a jax.tree_util.Partial avoids retracing
+StepFn = Callable[[World, Robots], tuple[Robots, Outcome]]
 
 
-class Asked(NamedTuple):
-    """N trials to make."""
+class TrialSpecs(NamedTuple):
+    """N trials to run."""
 
-    number: Int[np.ndarray, " N"]  # from which it starts; twice only on different lanes
+    number: Int[np.ndarray, " N"]  # determines the start; may repeat only on different lanes
     kind: Int[np.ndarray, " N"]  # of the lane
     level: Int[np.ndarray, " N"]
-    spread: Spread | None = None  # [N] each: how much of what is randomised; all when left out
+    spread: Spread | None = None  # [N] each: share of the randomisation (default: all)
 
 
 class Trials(NamedTuple):
-    """The outcome of N trials."""
+    """Outcome of N trials."""
 
     speed: Float[np.ndarray, " N"]  # m/s forward, commanded
     ending: Int[np.ndarray, " N"]  # index into ENDINGS
@@ -60,16 +61,16 @@ class Trials(NamedTuple):
 
     @property
     def succeeded(self) -> Bool[np.ndarray, " N"]:
-        """The robot came to the lane's end in time."""
+        """Whether the robot reached the lane's end in time."""
         return self.ending == 0
 
     def failures(self) -> dict[str, int]:
-        """Return how many trials failed in each way."""
+        """Count the trials that failed in each way."""
         return {name: int((self.ending == ENDINGS.index(name)).sum()) for name in FAILURES}
 
 
 class Trace(NamedTuple):
-    """What is seen of E robots at T steps; after a robot's first end it is another's."""
+    """Measures of E robots at T steps; after a robot's first end they belong to a new episode."""
 
     ending: Ending  # [T, E] each
     progress: Float[Array | np.ndarray, "T E"]  # m from the start along the lane
@@ -77,75 +78,77 @@ class Trace(NamedTuple):
     y: Float[Array | np.ndarray, "T E"]  # m across the lane, before the step
 
 
-def follow(train: ppo.TrainState) -> Walker:
-    """Return what a policy's mean action makes of robots, without noise."""
-    return jax.tree_util.Partial(_follow, train)
+def make_step_fn(train: ppo.TrainState) -> StepFn:
+    """Create a step function that applies the policy's mean action, without noise."""
+    return jax.tree_util.Partial(_apply_policy, train)
 
 
-def begin(
+def start_robots(
     world: World, seed: int, number: Int[np.ndarray, " E"],
     kind: Int[np.ndarray, " E"], level: Int[np.ndarray, " E"],
 ) -> Robots:  # fmt: skip
-    """Return the robots at the start of the trials of these numbers, on these lanes."""
+    """Place robots at the start of the trials of these numbers, on these lanes."""
     key = jax.random.key(SEED + seed)
     arrays = [jnp.asarray(x, jnp.int32) for x in (number, kind, level)]
-    return _begin(world, key, *arrays, even_spread(np.ones(len(number))))
+    return _start(world, key, *arrays, even_spread(np.ones(len(number))))
 
 
 def run(
     world: World,
-    walker: Walker,
-    asked: Asked,
+    step_fn: StepFn,
+    specs: TrialSpecs,
     seed: int,
     block: int,
-    ended: Callable[[int], None] = lambda count: None,
+    on_finished: Callable[[int], None] = lambda count: None,
 ) -> Trials:
-    """Return what becomes of the trials.
+    """Run the trials and classify their outcomes.
 
     Args:
-        world: a kind that is not level across must be alone in it: see camera_feed.render_frames.
-        walker: what steps the robots.
-        asked: the trials.
+        world: a kind that is not level across must be its only one: see camera_feed.render_frames.
+        step_fn: steps the robots.
+        specs: the trials.
         seed: of the starts and commands.
-        block: robots that are stepped together on one device.
-        ended: is told how many trials have come to an end since the last time.
+        block: robots stepped together on one device.
+        on_finished: called with the number of trials that have ended since the last call.
     """
-    places = _Places(asked.number, block)
+    slots = _Slots(specs.number, block)
     mesh = jax.make_mesh(
-        (places.blocks,), (AXIS,), axis_types=(AxisType.Auto,),
-        devices=jax.devices()[: places.blocks],
+        (slots.blocks,), (AXIS,), axis_types=(AxisType.Auto,),
+        devices=jax.devices()[: slots.blocks],
     )  # fmt: skip
-    world, walker = jax.device_put((world, walker), NamedSharding(mesh, P()))
+    world, step_fn = jax.device_put((world, step_fn), NamedSharding(mesh, P()))
     key = jax.random.key(SEED + seed)
-    spread = asked.spread or even_spread(np.ones(len(asked.number)))
-    found: dict[int, Trials] = {}
+    spread = specs.spread or even_spread(np.ones(len(specs.number)))
+    results: dict[int, Trials] = {}
     robots, clock = None, 0
-    while places.left:
-        if not places.courses:
+    while slots.has_trials:
+        if not slots.active:
             robots, clock = None, 0
-        if _is_in_phase(world.config, clock) and (new := places.filled()).size:
-            lanes = (jnp.asarray(x[places.trial], jnp.int32) for x in asked[:3])
-            of = jax.tree.map(lambda x: jnp.asarray(x)[places.trial], spread)
-            begun = _begin_on(world, key, *lanes, of, mesh)
-            places.begin(new, np.asarray(begun.env.command[:, 0]))
-            is_new = np.isin(np.arange(places.trial.size), new)
-            robots = begun if robots is None else _replaced(robots, begun, is_new, world.config)
-        robots, part = _steps(world, walker, robots, mesh)
+        if _is_camera_in_phase(world.config, clock) and (new := slots.fill()).size:
+            lanes = (jnp.asarray(x[slots.trial], jnp.int32) for x in specs[:3])
+            of = jax.tree.map(lambda x: jnp.asarray(x)[slots.trial], spread)
+            fresh = _start_on_mesh(world, key, *lanes, of, mesh)
+            slots.start(new, np.asarray(fresh.env.command[:, 0]))
+            is_new = np.isin(np.arange(slots.trial.size), new)
+            robots = (
+                fresh if robots is None else _replace_robots(robots, fresh, is_new, world.config)
+            )
+        robots, part = _run_chunk(world, step_fn, robots, mesh)
         clock += CHUNK
-        over = places.follow(jax.tree.map(np.asarray, part), world.config)
-        found |= over
-        ended(len(over))
-    return Trials(*map(np.concatenate, zip(*(found[k] for k in sorted(found)), strict=True)))
+        over = slots.update(jax.tree.map(np.asarray, part), world.config)
+        results |= over
+        on_finished(len(over))
+    return Trials(*map(np.concatenate, zip(*(results[k] for k in sorted(results)), strict=True)))
 
 
-def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trials:
-    """Return each robot's outcome; `period` lies between two steps, s.
+def classify(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trials:
+    """Classify each robot's outcome; `period` is the time between two steps, s.
 
-    One that has fallen has failed wherever it is, and so has one that has stalled before; who is
-    still on its way at the last step is late.
+    A fall is a failure wherever it happens, and so is an earlier stall; a robot still on its way
+    at the last step is late.
     """
     steps = len(trace.progress)
-    end, stalled = _ends(trace, speed, period)
+    end, stalled = _first_ends(trace, speed, period)
     last = np.minimum(np.minimum(end, stalled), steps - 1)
     at_last = lambda flags: np.asarray(flags)[last, np.arange(len(last))] & (end <= stalled)
     names = [*FALLS, "finished"]
@@ -155,94 +158,93 @@ def judged(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trial
         [ENDINGS.index(name) for name in (*names, "stalled")],
         ENDINGS.index("late"),
     )
-    lived = np.arange(steps)[:, None] <= last
-    drift, aside = lateral_drift.spans(np.asarray(trace.y), lived)
+    active = np.arange(steps)[:, None] <= last
+    drift, aside = lateral_drift.measure(np.asarray(trace.y), active)
     return Trials(
         speed=speed,
         ending=ending,
         seconds=(last + 1) * period,
-        forward=np.sum(trace.forward * lived, axis=0) / (last + 1),
+        forward=np.sum(trace.forward * active, axis=0) / (last + 1),
         drift=drift,
         aside=aside,
     )
 
 
 @dataclasses.dataclass
-class _Course:
-    """A trial that is under way, and what has been seen of it."""
+class _ActiveTrial:
+    """A running trial and its measures so far."""
 
     trial: int
     speed: Float[np.ndarray, "1"]  # m/s, commanded
     parts: list[Trace] = dataclasses.field(default_factory=list)
 
 
-class _Places:
-    """Which trial is made at each place of the blocks, and which ones wait for one."""
+class _Slots:
+    """The trial in each slot of the blocks, and the trials waiting for a slot."""
 
     def __init__(self, number: Int[np.ndarray, " N"], block: int) -> None:
         row = number % block
         self._waiting = [collections.deque(np.flatnonzero(row == k)) for k in range(block)]
         self.blocks = min(jax.device_count(), max(map(len, self._waiting)))
-        self.trial = np.zeros(self.blocks * block, int)  # where none is left, any will do
-        self.courses: dict[int, _Course] = {}  # by place
+        self.trial = np.zeros(self.blocks * block, int)  # any trial where none is left
+        self.active: dict[int, _ActiveTrial] = {}  # by slot
 
     @property
-    def left(self) -> bool:
-        """Whether there are trials that have not come to an end."""
-        return bool(self.courses) or any(self._waiting)
+    def has_trials(self) -> bool:
+        """Whether any trial has not ended."""
+        return bool(self.active) or any(self._waiting)
 
-    def filled(self) -> Int[np.ndarray, " n"]:
-        """Return the free places that have been given the next trial."""
+    def fill(self) -> Int[np.ndarray, " n"]:
+        """Assign the next trials to free slots, and return these slots."""
         new = []
-        for place in range(self.trial.size):
-            waiting = self._waiting[place % len(self._waiting)]
-            if place not in self.courses and waiting:
-                self.trial[place] = waiting.popleft()
-                new.append(place)
+        for slot in range(self.trial.size):
+            waiting = self._waiting[slot % len(self._waiting)]
+            if slot not in self.active and waiting:
+                self.trial[slot] = waiting.popleft()
+                new.append(slot)
         return np.array(new, int)
 
-    def begin(self, new: Int[np.ndarray, " n"], speed: Float[np.ndarray, " E"]) -> None:
-        """Follow the trials at these places from here on."""
-        self.courses |= {k: _Course(int(self.trial[k]), speed[k : k + 1]) for k in new}
+    def start(self, new: Int[np.ndarray, " n"], speed: Float[np.ndarray, " E"]) -> None:
+        """Start to follow the trials in these slots."""
+        self.active |= {k: _ActiveTrial(int(self.trial[k]), speed[k : k + 1]) for k in new}
 
-    def follow(self, part: Trace, c: Config) -> dict[int, Trials]:
-        """Return the trials that have come to an end in these `CHUNK` steps."""
+    def update(self, part: Trace, c: Config) -> dict[int, Trials]:
+        """Add these `CHUNK` steps, and return the trials that ended in them."""
         period, over = c.physics.control_period, {}
-        for place, course in list(self.courses.items()):
-            course.parts.append(jax.tree.map(lambda x, k=place: x[:, k : k + 1], part))
-            trace = jax.tree.map(lambda *x: np.concatenate(x), *course.parts)
+        for slot, running in list(self.active.items()):
+            running.parts.append(jax.tree.map(lambda x, k=slot: x[:, k : k + 1], part))
+            trace = jax.tree.map(lambda *x: np.concatenate(x), *running.parts)
             steps = len(trace.progress)
-            first = np.minimum(*_ends(trace, course.speed, period))
+            first = np.minimum(*_first_ends(trace, running.speed, period))
             if first[0] < steps or steps * period >= c.episode.length:
-                over[course.trial] = judged(trace, course.speed, period)
-                del self.courses[place]
+                over[running.trial] = classify(trace, running.speed, period)
+                del self.active[slot]
         return over
 
 
-def _is_in_phase(c: Config, clock: int) -> bool:
-    """Return whether a trial may begin: whether frames come from now on as they do at first."""
+def _is_camera_in_phase(c: Config, clock: int) -> bool:
+    """Check whether a trial may start: whether frames follow the same pattern as from step 0."""
     period = c.physics.control_period
     following = 1 + np.arange(round(c.episode.length / period))
     first, now = (depth.is_due(k + following, c.camera, period) for k in (0, clock))
     return c.network.variant == "blind" or bool(jnp.all(first == now))
 
 
-def _ends(
+def _first_ends(
     trace: Trace, speed: Float[np.ndarray, " E"], period: float
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
-    """Return the step at which each episode ended, and that at which it stalled; T for never."""
+    """Find the steps at which each episode ended and stalled; T for never."""
     over = np.asarray(trace.ending.terminated | trace.ending.truncated)
     end = np.where(over.any(axis=0), over.argmax(axis=0), len(over))
     return end, stall.stalls(np.asarray(trace.progress), speed, period)
 
 
-def _follow(train: ppo.TrainState, world: World, robots: Robots) -> tuple[Robots, Outcome]:
-    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
-    memory, policy = rollout.policy_step(nets, train, robots)
-    return rollout.env_step(world, robots, memory, policy.mean[0])
+def _apply_policy(train: ppo.TrainState, world: World, robots: Robots) -> tuple[Robots, Outcome]:
+    robots, _policy, outcome = rollout.step_policy(world, train, robots)
+    return robots, outcome
 
 
-def _started(
+def _init_robots(
     world: World, key: PRNGKeyArray, number: Int[Array, " E"],
     kind: Int[Array, " E"], level: Int[Array, " E"], spread: Spread,
 ) -> Robots:  # fmt: skip
@@ -253,45 +255,45 @@ def _started(
     return rollout.init_robots(world, state, split[:, 1])
 
 
-_begin = jax.jit(_started)
+_start = jax.jit(_init_robots)
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-def _begin_on(
+def _start_on_mesh(
     world: World, key: PRNGKeyArray, number: Int[Array, " E"],
     kind: Int[Array, " E"], level: Int[Array, " E"], spread: Spread, mesh: Mesh,
 ) -> Robots:  # fmt: skip
-    """Do the same on the devices of the mesh."""
+    """Place the robots on the devices of the mesh."""
     robots, each = _partition(world.config), P(AXIS)
     start = jax.shard_map(
-        _started, mesh=mesh, in_specs=(P(), P(), each, each, each, each), out_specs=robots,
+        _init_robots, mesh=mesh, in_specs=(P(), P(), each, each, each, each), out_specs=robots,
         check_vma=False,
     )  # fmt: skip
     return start(world, key, number, kind, level, spread)
 
 
 @functools.partial(jax.jit, static_argnames="c")
-def _replaced(robots: Robots, begun: Robots, is_new: Bool[Array, " E"], c: Config) -> Robots:
-    """Return the robots, in place of some those that begin; the cameras' clock goes on."""
+def _replace_robots(robots: Robots, fresh: Robots, is_new: Bool[Array, " E"], c: Config) -> Robots:
+    """Replace the new robots by fresh ones; the cameras' clock continues."""
 
-    def chosen(spec: P, old: Array, new: Array) -> Array:
+    def choose(spec: P, old: Array, new: Array) -> Array:
         if not spec:
             return old
         axes = [k for k in range(old.ndim) if k != len(spec) - 1]
         return jnp.where(jnp.expand_dims(is_new, axes), new, old)
 
-    of = lambda spec, old, new: jax.tree.map(functools.partial(chosen, spec), old, new)
-    return jax.tree.map(of, _partition(c), robots, begun, is_leaf=lambda x: isinstance(x, P))
+    of = lambda spec, old, new: jax.tree.map(functools.partial(choose, spec), old, new)
+    return jax.tree.map(of, _partition(c), robots, fresh, is_leaf=lambda x: isinstance(x, P))
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-def _steps(world: World, walker: Walker, robots: Robots, mesh: Mesh) -> tuple[Robots, Trace]:
-    """Advance by `CHUNK` control steps."""
+def _run_chunk(world: World, step_fn: StepFn, robots: Robots, mesh: Mesh) -> tuple[Robots, Trace]:
+    """Step the robots `CHUNK` times."""
 
-    def advance(world: World, walker: Walker, robots: Robots) -> tuple[Robots, Trace]:
+    def advance(world: World, step_fn: StepFn, robots: Robots) -> tuple[Robots, Trace]:
         def step(robots: Robots, _: None) -> tuple[Robots, Trace]:
             y = robots.env.body.qpos[:, 1]
-            robots, outcome = walker(world, robots)
+            robots, outcome = step_fn(world, robots)
             m = outcome.measures
             return robots, Trace(outcome.ending, m.progress, m.forward_speed, y)
 
@@ -302,7 +304,7 @@ def _steps(world: World, walker: Walker, robots: Robots, mesh: Mesh) -> tuple[Ro
         advance, mesh=mesh, in_specs=(P(), P(), place), out_specs=(place, P(None, AXIS)),
         check_vma=False,
     )  # fmt: skip
-    return shared(world, walker, robots)
+    return shared(world, step_fn, robots)
 
 
 def _partition(c: Config) -> Robots:

@@ -1,4 +1,4 @@
-"""Episodes on flat ground, counted until each robot's first end."""
+"""Episodes on flat ground, each counted until its robot's first end."""
 
 import dataclasses
 from typing import NamedTuple
@@ -18,31 +18,31 @@ from cref_jax.physics.simulation import Physics
 from cref_jax.training import rollout
 
 
-class Walk(NamedTuple):
-    """The outcome of E episodes."""
+class WalkResult(NamedTuple):
+    """Outcome of E episodes."""
 
     episodes: int
     fell: int
     by_cause: dict[str, int]
     speed_error: float  # m/s, |commanded - walked| forward, mean over episodes
     tracking_error: float  # m/s, of the planar velocity at each step
-    airborne: tuple[float, float]  # share of time that the left and the right foot are off ground
-    step_seconds: float  # mean time between two touchdowns of one foot
+    airborne: tuple[float, float]  # share of time off the ground, left and right foot
+    step_seconds: float  # mean time between touchdowns of one foot
     sideways: dict[str, float]  # m, see lateral_drift.summarize
 
     def line(self) -> str:
-        """Return the outcome in one line for people."""
+        """Format the outcome as one line."""
         left, right = self.airborne
         return (
             f"{self.episodes - self.fell} of {self.episodes} episodes without a fall, "
             f"speed error {self.speed_error:.3f} m/s, "
             f"feet off the ground {left:.0%} and {right:.0%} of the time, "
-            f"{self.step_seconds:.2f} s a stride"
+            f"{self.step_seconds:.2f} s per stride"
         )
 
 
 class _Step(NamedTuple):
-    """What one step of an episode adds to its sums."""
+    """Contributions of one step to an episode's sums."""
 
     alive: Bool[Array, " E"]
     forward_speed: Float[Array, " E"]
@@ -54,22 +54,21 @@ class _Step(NamedTuple):
 
 def walk(
     c: Config, physics: Physics, train: ppo.TrainState, episodes: int = 100, seed: int = 0
-) -> Walk:
-    """Return how the policy's mean action does on the flat lane, without noise or pushes."""
+) -> WalkResult:
+    """Run the policy's mean action on the flat lane, without noise or pushes."""
     flat = dataclasses.replace(c.terrain, name="flat")
     world = make_world(protocol.evaluation_config(dataclasses.replace(c, terrain=flat)), physics)
     steps = round(SECONDS / c.physics.control_period)
     key = jax.random.key(trials.SEED + seed)
-    ending, trace = _episodes(world, train, key, episodes, steps)
+    ending, trace = _run_episodes(world, train, key, episodes, steps)
     return _summarize(jax.tree.map(np.asarray, ending), jax.tree.map(np.asarray, trace), c)
 
 
 @jax.jit(static_argnames=("episodes", "steps"))
-def _episodes(
+def _run_episodes(
     world: World, train: ppo.TrainState, key: PRNGKeyArray, episodes: int, steps: int
 ) -> tuple[Ending, _Step]:
-    """Return each robot's first end, and its steps [T, E] up to there."""
-    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+    """Simulate the episodes; return each robot's first end and its steps [T, E] until then."""
     robots = rollout.start(world, key, episodes)
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
 
@@ -77,11 +76,10 @@ def _episodes(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
     ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _Step]]:
         before, alive = carry
-        memory, policy = rollout.policy_step(nets, train, before)
-        robots, outcome = rollout.env_step(world, before, memory, policy.mean[0])
+        robots, _policy, outcome = rollout.step_policy(world, train, before)
         measures, ending = outcome.measures, outcome.ending
         counted = Ending(*(flag & alive for flag in ending))
-        seen = _Step(
+        record = _Step(
             alive=alive,
             forward_speed=measures.forward_speed,
             forward_error=measures.forward_command - measures.forward_speed,
@@ -89,34 +87,34 @@ def _episodes(
             airborne=measures.airborne,
             y=before.env.body.qpos[:, 1],
         )
-        return (robots, alive & ~ending.terminated & ~ending.truncated), (counted, seen)
+        return (robots, alive & ~ending.terminated & ~ending.truncated), (counted, record)
 
     first = (robots, jnp.ones(episodes, bool))
     _, (endings, trace) = jax.lax.scan(step, first, None, length=steps)
     return Ending(*(flag.any(axis=0) for flag in endings)), trace
 
 
-def _by_cause(ending: Ending) -> dict[str, int]:
-    """Return how many robots fell in each way; one that did in several counts for the first."""
+def _count_by_cause(ending: Ending) -> dict[str, int]:
+    """Count the falls by cause; several causes at once count as the first."""
     flags = np.stack([getattr(ending, name) for name in trials.FALLS])
     first = np.where(flags.any(axis=0), flags.argmax(axis=0), -1)
     return {name: int((first == k).sum()) for k, name in enumerate(trials.FALLS)}
 
 
-def _summarize(ending: Ending, trace: _Step, c: Config) -> Walk:
-    alive, lived = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
-    of_episode = lambda x: np.sum(x * alive, axis=0) / lived
+def _summarize(ending: Ending, trace: _Step, c: Config) -> WalkResult:
+    alive, steps = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
+    of_episode = lambda x: np.sum(x * alive, axis=0) / steps
     both = trace.alive[..., None]
     airborne = np.sum(trace.airborne * both, axis=(0, 1)) / np.maximum(alive.sum(), 1)
     touchdowns = (trace.airborne[:-1] & ~trace.airborne[1:] & both[1:]).sum()
-    seconds = 2 * alive.sum() * c.physics.control_period  # of foot and robot
-    return Walk(
+    seconds = 2 * alive.sum() * c.physics.control_period  # summed over feet and robots
+    return WalkResult(
         episodes=alive.shape[1],
         fell=int(ending.terminated.sum()),
-        by_cause=_by_cause(ending),
+        by_cause=_count_by_cause(ending),
         speed_error=float(np.abs(of_episode(trace.forward_error)).mean()),
         tracking_error=float(of_episode(trace.tracking_error).mean()),
         airborne=(float(airborne[0]), float(airborne[1])),
         step_seconds=float(seconds / max(touchdowns, 1)),
-        sideways=lateral_drift.summarize(*lateral_drift.spans(trace.y, alive)),
+        sideways=lateral_drift.summarize(*lateral_drift.measure(trace.y, alive)),
     )

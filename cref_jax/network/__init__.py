@@ -3,28 +3,28 @@
 from cref_jax.network.actor_critic import Actor, Critic
 from cref_jax.network.records import (
     Carry,
+    DepthInput,
+    EncodedInput,
     Features,
     Output,
-    Sight,
-    View,
-    as_image,
-    in_patches,
+    image_to_patches,
     initial_carry,
-    no_features,
+    patches_to_image,
     strides,
+    zero_features,
 )
 
 __all__ = [
     "Actor",
     "Carry",
     "Critic",
+    "DepthInput",
+    "EncodedInput",
     "Features",
     "Output",
-    "Sight",
-    "View",
-    "as_image",
-    "in_patches",
+    "image_to_patches",
     "initial_carry",
-    "no_features",
+    "patches_to_image",
     "strides",
+    "zero_features",
 ]

@@ -1,7 +1,7 @@
-"""The layers that the networks are made of, in the forms that are quick on a CPU, too.
+"""The layers of the networks, in forms that are fast on a CPU as well.
 
-Everything has the axes [T, E, ...]. Only the recurrent cells walk through time; every other layer
-sees T * E samples at once.
+All arrays have the axes [T, E, ...]. Only the recurrent cells iterate over time; every other layer
+processes T * E samples at once.
 """
 
 from collections.abc import Sequence
@@ -15,20 +15,20 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cref_jax.network import recurrent
 
-_EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's own
+_EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's default
 
 
 def dense(features: int, name: str, **settings: Any) -> nn.Dense:
-    """Return a dense layer that knows the quicker gradient of its product."""
+    """Create a dense layer with the faster gradient of `product`."""
     return nn.Dense(features, dot_general=_dot_general, name=name, **settings)
 
 
 @jax.custom_vjp
 def elu(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Return x where it is above 0, and e^x - 1 elsewhere.
+    """Compute x where it is above 0, and e^x - 1 elsewhere.
 
-    The derivative is read off the result, y + 1 below 0, so that nothing but the result is kept for
-    the gradient and no exponential is taken twice.
+    The derivative below 0 is y + 1, so that only the result is stored for the gradient and no
+    exponential is computed twice.
     """
     return jnp.where(x > 0.0, x, jnp.exp(jnp.minimum(x, 0.0)) - 1.0)
 
@@ -48,7 +48,7 @@ elu.defvjp(_elu_forward, _elu_backward)
 class MLP(nn.Module):
     """Dense layers with ELU between them and none after the last.
 
-    With a `scale`, the last layer starts as an orthogonal matrix times it.
+    With a `scale`, the last layer is initialised to an orthogonal matrix times it.
     """
 
     widths: Sequence[int]
@@ -56,7 +56,7 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "T E _"]) -> Float[Array, "T E _"]:
-        """Return the last layer's output."""
+        """Compute the last layer's output."""
         *hidden, last = self.widths
         for i, width in enumerate(hidden):
             x = elu(dense(width, name=f"layer_{i}")(x))
@@ -67,10 +67,10 @@ class MLP(nn.Module):
 
 
 class Convolution(nn.Module):
-    """A convolution whose output is the input's size over the stride, as one matrix product.
+    """A convolution as one matrix product; its output has the input's size over the stride.
 
     The patches are gathered by strided slices: XLA's own convolution takes 1.6 times as long on a
-    CPU. Padding is zero, and as equal on both sides as it can be.
+    CPU. The input is zero-padded, as evenly on both sides as possible.
     """
 
     channels: int
@@ -79,7 +79,7 @@ class Convolution(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "T E H W I"]) -> Float[Array, "T E h w O"]:
-        """Return the filtered image; its sides must be whole multiples of the stride."""
+        """Filter an image whose sides are multiples of the stride."""
         height, width = (side // self.stride for side in x.shape[2:4])
         before = (self.kernel - self.stride) // 2
         after = self.kernel - self.stride - before
@@ -94,10 +94,10 @@ class Convolution(nn.Module):
 
 
 class PatchFilter(nn.Module):
-    """A convolution without overlap, on patches: one product for all of them.
+    """A convolution without overlap, as one product for all patches.
 
-    Its parameters are those of `Convolution`. The outputs of `group` successive patches stand side
-    by side, as the next filter reads them.
+    Its parameters are those of `Convolution`. The outputs of `group` successive patches are
+    concatenated, as the next filter reads them.
     """
 
     channels: int
@@ -105,10 +105,10 @@ class PatchFilter(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "patches I"]) -> Float[Array, "groups gO"]:
-        """Return the filtered patches."""
+        """Filter the patches."""
         kernel, bias = _Filter(self.channels, name="filter")(x.shape[-1])
-        # a product, not a tile: XLA would look each number of the bias up by its index, and a loop
-        # with such an index in it does not vectorise
+        # a product, not a tile: XLA would gather each element of the bias by index, and such a loop
+        # does not vectorise
         again = np.tile(np.eye(self.channels, dtype=np.float32), self.group)
         bias = jnp.matmul(bias, again, precision=jax.lax.Precision.HIGHEST)
         return product(x, kernel).reshape(-1, self.group * self.channels) + bias
@@ -121,36 +121,36 @@ class _Filter(nn.Module):
 
     @nn.compact
     def __call__(self, inputs: int) -> tuple[Float[Array, "I O"], Float[Array, " O"]]:
-        """Return kernel and bias."""
+        """Create kernel and bias."""
         shape = inputs, self.features
         kernel = self.param("kernel", nn.linear.default_kernel_init, shape)
         return kernel, self.param("bias", nn.initializers.zeros, shape[1:])
 
 
 class LayerNorm(nn.Module):
-    """Normalisation of the last axis to mean 0 and variance 1, then scaled and shifted."""
+    """Normalisation of the last axis to mean 0 and variance 1, then scale and shift."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
-        """Return the normalised x."""
+        """Normalise x."""
         shape = x.shape[-1:]
         scale = self.param("scale", nn.initializers.ones, shape)
-        return _normalised(x, scale, self.param("bias", nn.initializers.zeros, shape))
+        return _normalize(x, scale, self.param("bias", nn.initializers.zeros, shape))
 
 
 @jax.custom_vjp
-def _normalised(
+def _normalize(
     x: Float[Array, "*n D"], scale: Float[Array, " D"], bias: Float[Array, " D"]
 ) -> Float[Array, "*n D"]:
-    """Return (x - mean) / sqrt(variance + 1e-6) * scale + bias.
+    """Compute (x - mean) / sqrt(variance + 1e-6) * scale + bias.
 
-    Only x and two numbers a row are kept for the gradient, which passes over x as few times as can
-    be: a tokenizer's normalisation moves more memory than its products.
+    Only x and two numbers per row are stored for the gradient, which reads x as few times as
+    possible: a tokenizer's normalisation moves more memory than its products.
     """
-    return _normalised_forward(x, scale, bias)[0]
+    return _normalize_forward(x, scale, bias)[0]
 
 
-def _normalised_forward(
+def _normalize_forward(
     x: Float[Array, "*n D"], scale: Float[Array, " D"], bias: Float[Array, " D"]
 ) -> tuple[Float[Array, "*n D"], tuple[Array, Array, Array, Array]]:
     mean = x.mean(axis=-1, keepdims=True)
@@ -159,10 +159,10 @@ def _normalised_forward(
     return (x - mean) * inverse * scale + bias, (x, mean, inverse, scale)
 
 
-def _normalised_backward(
-    kept: tuple[Array, Array, Array, Array], g: Float[Array, "*n D"]
+def _normalize_backward(
+    residuals: tuple[Array, Array, Array, Array], g: Float[Array, "*n D"]
 ) -> tuple[Float[Array, "*n D"], Float[Array, " D"], Float[Array, " D"]]:
-    x, mean, inverse, scale = kept
+    x, mean, inverse, scale = residuals
     unit, scaled = (x - mean) * inverse, g * scale
     shift = scaled.mean(axis=-1, keepdims=True)
     stretch = (scaled * unit).mean(axis=-1, keepdims=True)
@@ -170,11 +170,11 @@ def _normalised_backward(
     return inverse * (scaled - shift - unit * stretch), (g * unit).sum(rows), g.sum(rows)
 
 
-_normalised.defvjp(_normalised_forward, _normalised_backward)
+_normalize.defvjp(_normalize_forward, _normalize_backward)
 
 
 class LSTM(nn.Module):
-    """A long short-term memory, gates in the order input, forget, candidate, output.
+    """A long short-term memory, with gates in the order input, forget, candidate, output.
 
     [i; f; g; o] = W x_t + U h_{t-1} + b
     c_t = sigmoid(f) c_{t-1} + sigmoid(i) tanh(g),  h_t = sigmoid(o) tanh(c_t)
@@ -189,7 +189,7 @@ class LSTM(nn.Module):
         x: Float[Array, "T E I"],
         begins: Bool[Array, "T E"],
     ) -> tuple[tuple[Float[Array, "E H"], Float[Array, "E H"]], Float[Array, "T E H"]]:
-        """Return (c, h) after the last step, and h of all steps."""
+        """Compute (c, h) after the last step, and h of all steps."""
         inputs = dense(4 * self.hidden, name="input")(x)
         kernel = self.param("recurrent", _stacked_orthogonal, (self.hidden, 4 * self.hidden))
 
@@ -204,7 +204,7 @@ class LSTM(nn.Module):
 
 
 class GRU(nn.Module):
-    """A gated recurrent unit, gates in the order reset, update, candidate.
+    """A gated recurrent unit, with gates in the order reset, update, candidate.
 
     r = sigmoid(W_r x + U_r h + b_r),  u = sigmoid(W_u x + U_u h + b_u)
     n = tanh(W_n x + b_n + r (U_n h + b_hn)),  h' = (1 - u) n + u h
@@ -216,7 +216,7 @@ class GRU(nn.Module):
     def __call__(
         self, memory: Float[Array, "E H"], x: Float[Array, "T E I"], begins: Bool[Array, "T E"]
     ) -> tuple[Float[Array, "E H"], Float[Array, "T E H"]]:
-        """Return h after the last step, and h of all steps."""
+        """Compute h after the last step, and h of all steps."""
         inputs = dense(3 * self.hidden, name="input")(x)
         kernel = self.param("recurrent", _stacked_orthogonal, (self.hidden, 3 * self.hidden))
         bias = self.param("candidate_bias", nn.initializers.zeros, (self.hidden,))
@@ -238,17 +238,17 @@ class GRU(nn.Module):
 def _dot_general(
     x: Float[Array, "*n I"], kernel: Float[Array, "I O"], dimensions: Any, precision: Any = None
 ) -> Float[Array, "*n O"]:
-    """Return x W under the name and arguments by which nn.Dense asks for it."""
+    """Compute x W, with the signature that nn.Dense expects."""
     del dimensions, precision
     return product(x, kernel)
 
 
 @jax.custom_vjp
 def product(x: Float[Array, "*n I"], kernel: Float[Array, "I O"]) -> Float[Array, "*n O"]:
-    """Return x W.
+    """Compute x W.
 
-    JAX writes the gradient of W as a transposed (g' x)', and a CPU then copies g to turn it over.
-    Written as x' g it takes a fifth less time for the whole network, and gives the same numbers.
+    JAX writes the gradient of W as a transposed (g' x)', for which a CPU copies g to transpose it.
+    Written as x' g, the whole network takes a fifth less time, with the same numbers.
     """
     return x @ kernel
 
@@ -260,9 +260,9 @@ def _product_forward(
 
 
 def _product_backward(
-    seen: tuple[Float[Array, "*n I"], Float[Array, "I O"]], g: Float[Array, "*n O"]
+    inputs: tuple[Float[Array, "*n I"], Float[Array, "I O"]], g: Float[Array, "*n O"]
 ) -> tuple[Float[Array, "*n I"], Float[Array, "I O"]]:
-    x, kernel = seen
+    x, kernel = inputs
     flat_x, flat_g = x.reshape(-1, x.shape[-1]), g.reshape(-1, g.shape[-1])
     return g @ kernel.T, flat_x.T @ flat_g
 
@@ -273,7 +273,7 @@ product.defvjp(_product_forward, _product_backward)
 def _stacked_orthogonal(
     key: PRNGKeyArray, shape: tuple[int, int], dtype: jnp.dtype = jnp.float32
 ) -> Float[Array, "H G"]:
-    """Return one orthogonal matrix for each gate, side by side."""
+    """Initialise one orthogonal matrix per gate, side by side."""
     hidden, gates = shape[0], shape[1] // shape[0]
     one = nn.initializers.orthogonal()
     return jnp.hstack([one(k, (hidden, hidden), dtype) for k in jax.random.split(key, gates)])

@@ -1,9 +1,9 @@
-"""Images in the order in which filters that do not overlap read them.
+"""Images in patch order, the order in which filters without overlap read them.
 
-A filter whose kernel is its stride reads each pixel once. In patch order an image is a matrix whose
-rows are what such a filter sees, so that a layer is a reshape and a product, and so is its
-gradient: nothing is gathered or turned over. Patches nest: with the strides 4 and 2, a token is
-2 x 2 patches, row by row, each of 4 x 4 pixels, row by row.
+A filter whose kernel equals its stride reads each pixel once. In patch order an image is a matrix
+whose rows are the inputs of such a filter, so that a layer is a reshape and a product, and so is
+its gradient: no gathers or transposes. Patches nest: with strides 4 and 2, a token is 2 x 2
+patches, row by row, each of 4 x 4 pixels, row by row.
 """
 
 import math
@@ -16,15 +16,15 @@ from jaxtyping import Array, Shaped
 def to_patches(
     image: Shaped[Array, "*n H W C"], strides: Sequence[int]
 ) -> Shaped[Array, "*n rows columns pixels C"]:
-    """Reorder images for layers of these strides, the first layer's first.
+    """Reorder images for layers with these strides, first layer first.
 
-    H and W are multiples of the strides' product; rows x columns are the positions of the last
-    layer, and `pixels` the values of each, in the order of the patches.
+    H and W are multiples of the strides' product; rows x columns are the last layer's positions,
+    and `pixels` the values of each, in patch order.
     """
     *lead, height, width, channels = image.shape
     side, steps = math.prod(strides), tuple(reversed(strides))
     split = image.reshape(*lead, height // side, *steps, width // side, *steps, channels)
-    across = 1 + len(steps)  # axes that a side of the image is split into
+    across = 1 + len(steps)  # axes into which a side of the image is split
     pairs = [axis for k in range(across) for axis in (k, across + k)]
     turned = jnp.transpose(
         split, [*range(len(lead)), *(len(lead) + k for k in pairs), split.ndim - 1]

@@ -1,1 +1,1 @@
-"""Reports as single HTML pages."""
+"""Reports as self-contained HTML pages."""

@@ -1,4 +1,4 @@
-"""Tables of an evaluation's page that are the same whatever was judged."""
+"""Tables of the evaluation page that several suites share."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,18 +9,18 @@ from cref_jax.pages.markup import MISSING, Column, Html, join, paragraph
 Row = Mapping[str, Any]
 
 
-def sideways(rows: Sequence[tuple[str, Row]]) -> Html:
-    """Return how far robots drift, and how near to the way's side they come, cm, by place."""
+def drift_table(rows: Sequence[tuple[str, Row]]) -> Html:
+    """Build the table of lateral drift and largest lateral offset, cm, per place."""
     columns = [Column("where")]
-    columns += [Column(n, True) for n in ("drift", "largest |y|, mean", "largest |y| of all")]
+    columns += [Column(n, True) for n in ("drift", "largest |y|, mean", "largest |y|, worst")]
     keys = ("drift_m", "largest_m", "worst_m")
     table = [(place, *(f"{100.0 * of[key]:.0f} cm" for key in keys)) for place, of in rows]
-    said = "Drift is |y| at the end, y = 0 the middle of the way, to which robots are steered."
-    return join(paragraph(said), markup.table(columns, table))
+    note = "Drift is |y| at the end of a trial; robots steer towards the centre line, y = 0."
+    return join(paragraph(note), markup.table(columns, table))
 
 
-def parts(rates: Sequence[tuple[str, str, float]]) -> Html:
-    """Return success with one part of the randomisation alone: a row a part, a column a place."""
+def part_table(rates: Sequence[tuple[str, str, float]]) -> Html:
+    """Build the table of success with one randomised part at a time: parts by places."""
     names = list(dict.fromkeys(name for name, _, _ in rates))
     places = list(dict.fromkeys(place for _, place, _ in rates))
     of = {(name, place): f"{100.0 * rate:.1f} %" for name, place, rate in rates}
@@ -28,17 +28,19 @@ def parts(rates: Sequence[tuple[str, str, float]]) -> Html:
     return markup.table(columns, [(n, *(of.get((n, p), MISSING) for p in places)) for n in names])
 
 
-def commands(rows: Sequence[Row]) -> Html:
-    """Return how each command was obeyed."""
-    columns = [Column("told: forward, left m/s, turn rad/s")]
-    columns += [Column(n, True) for n in ("does", "error", "fell", "feet up, left and right")]
-    said = lambda values: MISSING if values is None else ", ".join(f"{x:.2f}" for x in values)
+def command_table(rows: Sequence[Row]) -> Html:
+    """Build the table of tracked velocity, error, falls and air time per command."""
+    columns = [Column("command: forward, left m/s, turn rad/s")]
+    columns += [
+        Column(n, True) for n in ("velocity", "error", "fell", "foot in the air, left and right")
+    ]
+    numbers = lambda values: MISSING if values is None else ", ".join(f"{x:.2f}" for x in values)
     shares = lambda of: MISSING if of is None else ", ".join(f"{100.0 * x:.1f} %" for x in of)
     table = [
         (
-            said(row["command"]),
-            said(row["velocity"]),
-            said(row["error"]),
+            numbers(row["command"]),
+            numbers(row["velocity"]),
+            numbers(row["error"]),
             f"{row['fell']} of {row['trials']}",
             shares(row["airborne"]),
         )

@@ -1,8 +1,8 @@
-"""One self-contained HTML file: it opens from disk, asks no network and runs no script.
+"""Building blocks of a self-contained HTML page without network access or scripts.
 
-Everything that is shown goes through `escaped`, so that no name or setting becomes markup. Only
-`Html` passes as it is, and only the functions of this module make it. A content security policy in
-the page's head forbids the rest, should one of them ever fail.
+All text passes through `escape`, so that no name or setting becomes markup. Only `Html` passes
+unchanged, and only the functions of this module create it. A content security policy in the page's
+head blocks scripts and external content in case one of them fails.
 """
 
 import base64
@@ -21,12 +21,12 @@ from matplotlib.figure import Figure
 from cref_jax.errors import ConfigError
 
 MEGABYTE = 1_000_000  # bytes
-MOST_PICTURE = 8 * MEGABYTE  # bytes of a file; assumed: far above any still of this program
-MOST_VIDEO = 30 * MEGABYTE  # bytes of a file; assumed: minutes of film, and browsers still open it
-CHART = (4.6, 2.7)  # inches: readable on a telephone, and two stand side by side on a screen
-MISSING = "-"  # where a number is not known
+MOST_PICTURE = 8 * MEGABYTE  # bytes per file; assumed: far above any still of this program
+MOST_VIDEO = 30 * MEGABYTE  # bytes per file; assumed: minutes of video that browsers still open
+CHART = (4.6, 2.7)  # inches: readable on a phone, and two fit side by side on a screen
+MISSING = "-"  # shown for an unknown number
 
-SIGNATURES = {  # suffix: media type, and the place and bytes that tell a file from its name
+SIGNATURES = {  # suffix: media type, then offset and bytes of the signature in the file
     ".png": ("image/png", 0, b"\x89PNG\r\n\x1a\n"),
     ".mp4": ("video/mp4", 4, b"ftyp"),
 }
@@ -42,9 +42,9 @@ CHART_STYLE = {
     "grid.alpha": 0.3,
     "legend.fontsize": 8,
     "legend.frameon": False,
-    "svg.fonttype": "path",  # letters as outlines: the same everywhere, whatever fonts there are
-    "svg.hashsalt": "cref_jax",  # equal charts are equal bytes
-    "text.parse_math": False,  # a name with two dollars is no formula
+    "svg.fonttype": "path",  # glyphs as outlines: no dependence on installed fonts
+    "svg.hashsalt": "cref_jax",  # equal charts give equal bytes
+    "text.parse_math": False,  # a name with two dollar signs is not a formula
 }
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d2129; --faint: #5c6470; --paper: #fff;
@@ -106,11 +106,11 @@ summary { cursor: pointer; color: var(--link); }
 
 
 class Html(str):
-    """Markup, as opposed to text that is yet to be escaped."""
+    """Markup, as opposed to text that still has to be escaped."""
 
 
 class Column(NamedTuple):
-    """The head of a column; numbers stand at its right."""
+    """A column heading; numbers are aligned right."""
 
     title: str
     number: bool = False
@@ -123,53 +123,53 @@ class Section(NamedTuple):
     body: Html
 
 
-def escaped(text: str) -> Html:
-    """Return text as markup that shows it; markup stays as it is."""
+def escape(text: str) -> Html:
+    """Escape text; `Html` is returned unchanged."""
     if isinstance(text, Html):
         return text
-    shown = text.encode("utf-8", "replace").decode()  # names of files may be no Unicode
+    shown = text.encode("utf-8", "replace").decode()  # file names may not be valid Unicode
     return Html(html.escape(shown))
 
 
 def join(*parts: str) -> Html:
-    """Return the parts one after another."""
-    return Html("".join(escaped(part) for part in parts))
+    """Concatenate parts, escaping plain text."""
+    return Html("".join(escape(part) for part in parts))
 
 
 def element(name: str, *content: str, **attributes: str) -> Html:
-    """Return an element; a `class` is written `class_`."""
-    shown = "".join(f' {key.rstrip("_")}="{escaped(v)}"' for key, v in attributes.items())
+    """Build an element; the attribute `class` is passed as `class_`."""
+    shown = "".join(f' {key.rstrip("_")}="{escape(v)}"' for key, v in attributes.items())
     return Html(f"<{name}{shown}>{join(*content)}</{name}>")
 
 
 def paragraph(*content: str) -> Html:
-    """Return a paragraph."""
+    """Build a paragraph."""
     return element("p", *content)
 
 
 def code(text: str) -> Html:
-    """Return what is typed or named exactly so."""
+    """Build inline code."""
     return element("code", text)
 
 
 def note(*content: str) -> Html:
-    """Return a line that says what is missing and how to get it."""
+    """Build a note, for example on missing data and the command that creates it."""
     return element("p", *content, class_="note")
 
 
 def tiles(values: Iterable[tuple[str, str]]) -> Html:
-    """Return the few figures that matter most, each with what it is."""
-    each = [element("div", element("b", value), element("span", what)) for value, what in values]
+    """Build tiles, each a headline figure above its label."""
+    each = [element("div", element("b", value), element("span", label)) for value, label in values]
     return element("div", *each, class_="tiles") if each else Html()
 
 
-def pairs(values: Iterable[tuple[str, str]]) -> Html:
-    """Return names and what they stand for."""
+def definition_list(values: Iterable[tuple[str, str]]) -> Html:
+    """Build a list of names and their values."""
     return element("dl", *(join(element("dt", k), element("dd", v)) for k, v in values))
 
 
 def table(columns: Sequence[Column], rows: Iterable[Sequence[str]], caption: str = "") -> Html:
-    """Return a table that scrolls where it is too wide; each row's first cell is its head."""
+    """Build a table that scrolls sideways if too wide; the first cell of a row is its heading."""
     kinds = ["number" if column.number else "" for column in columns]
     cell = lambda name, text, kind, **more: (
         element(name, text, class_=kind, **more) if kind else element(name, text, **more)
@@ -192,32 +192,32 @@ def table(columns: Sequence[Column], rows: Iterable[Sequence[str]], caption: str
     )
 
 
-def folded(summary: str, *content: str) -> Html:
-    """Return content that is shown on a click."""
+def collapsible(summary: str, *content: str) -> Html:
+    """Build content that is collapsed until clicked."""
     return element("details", element("summary", summary), *content)
 
 
-def nested(sections: Iterable[Section]) -> Html:
-    """Return sections to stand inside of one."""
+def subsections(sections: Iterable[Section]) -> Html:
+    """Build the subsections of a section."""
     return join(*(join(element("h3", title), body) for title, body in sections))
 
 
-def charts(*drawn: Html) -> Html:
-    """Return charts side by side, as many as there is room for."""
-    return element("div", *drawn, class_="charts")
+def charts(*plots: Html) -> Html:
+    """Lay charts out side by side, as many per row as fit."""
+    return element("div", *plots, class_="charts")
 
 
-def wide(*drawn: Html) -> Html:
-    """Return charts of many rows, larger than those of `charts`."""
-    return element("div", *drawn, class_="charts wide")
+def wide_charts(*plots: Html) -> Html:
+    """Lay out charts with many rows, larger than those of `charts`."""
+    return element("div", *plots, class_="charts wide")
 
 
 def chart(
     paint: Callable[[Axes], None], alt: str, caption: str = "", size: tuple[float, float] = CHART
 ) -> Html:
-    """Return what `paint` draws into one pair of axes; `size` in inches.
+    """Render the figure that `paint` draws on a single Axes; `size` in inches.
 
-    It is an image of its own, so that the names inside of two charts cannot meet.
+    Each chart is a separate image, so that the element ids of two charts cannot clash.
     """
     with matplotlib.rc_context(CHART_STYLE):
         figure = Figure(figsize=size, layout="constrained")
@@ -225,35 +225,35 @@ def chart(
         file = io.StringIO()
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(file, format="svg", metadata=nothing)
-    # a hundredth of a point is finer than a screen, and half the bytes
-    short = re.sub(r"[ML] -?[\d.]+ -?[\d.]+ ", _rounded, file.getvalue())
+    # 0.01 pt is finer than a screen pixel and halves the size
+    short = re.sub(r"[ML] -?[\d.]+ -?[\d.]+ ", _round_numbers, file.getvalue())
     return _image("image/svg+xml", short.encode(), alt, caption)
 
 
 def media(path: Path, most: int | None = None) -> Html:
-    """Return a picture or a film inside the page, or a note where that cannot be.
+    """Embed an image or a video, or return a note if it is too large or unreadable.
 
-    `most` is the largest size in bytes; that of its kind when left out.
+    `most` is the size limit in bytes; the default is the limit of the file type.
     """
     kind, place, signature = SIGNATURES[path.suffix.lower()]
-    film = kind.startswith("video")
-    most = (MOST_VIDEO if film else MOST_PICTURE) if most is None else most
+    is_video = kind.startswith("video")
+    most = (MOST_VIDEO if is_video else MOST_PICTURE) if most is None else most
     try:
         size = path.stat().st_size
         if size > most:
             return note(
                 code(path.name),
-                f" ({size / MEGABYTE:.1f} MB) is left out: there is room for "
-                f"{most / MEGABYTE:.1f} MB. It lies in {path.parent}.",
+                f" ({size / MEGABYTE:.1f} MB) is left out: it exceeds the limit of "
+                f"{most / MEGABYTE:.1f} MB. It is in {path.parent}.",
             )
         content = path.read_bytes()
     except OSError as error:
         return note(code(path.name), f" cannot be read: {error.strerror}.")
     if content[place : place + len(signature)] != signature:
-        return note(code(path.name), f" is no {path.suffix.lower()[1:]} file.")
-    if not film:
+        return note(code(path.name), f" is not a valid {path.suffix.lower()[1:]} file.")
+    if not is_video:
         return element("div", _image(kind, content, path.name, path.name), class_="media")
-    shown = element("video", controls="", preload="metadata", src=_inside(kind, content))
+    shown = element("video", controls="", preload="metadata", src=_data_url(kind, content))
     return element(
         "div",
         element("figure", shown, element("figcaption", path.name)),
@@ -262,7 +262,7 @@ def media(path: Path, most: int | None = None) -> Html:
 
 
 def document(title: str, lead: str, sections: Sequence[Section], foot: str = "") -> str:
-    """Return a whole page; `lead` stands under its title, links to the sections under that."""
+    """Assemble the page: title, `lead`, links to the sections, the sections and `foot`."""
     links = [element("a", s.title, href=f"#part{k}") for k, s in enumerate(sections)]
     bodies = [
         element("section", element("h2", s.title), s.body, id=f"part{k}")
@@ -285,20 +285,20 @@ def document(title: str, lead: str, sections: Sequence[Section], foot: str = "")
 
 
 def check_name(out: Path) -> None:
-    """Refuse a page that no browser would open as one.
+    """Check that the file name ends in .html.
 
     Raises:
-        ConfigError: the name does not end in .html.
+        ConfigError: it does not.
     """
     if out.suffix != ".html":
-        raise ConfigError(f"a page ends in .html, and {out} does not")
+        raise ConfigError(f"the name of a page must end in .html: {out}")
 
 
 def write(out: Path, document: str) -> None:
-    """Write the page whole or not at all.
+    """Write the page atomically.
 
     Raises:
-        ConfigError: its name does not end in .html, or the disk refused.
+        ConfigError: the name does not end in .html, or the file cannot be written.
     """
     check_name(out)
     part = out.with_suffix(".part")
@@ -312,14 +312,14 @@ def write(out: Path, document: str) -> None:
         raise ConfigError(f"cannot write {out}: {error.strerror}") from None
 
 
-def _rounded(point: re.Match[str]) -> str:
+def _round_numbers(point: re.Match[str]) -> str:
     return re.sub(r"\d+\.\d{3,}", lambda number: f"{float(number[0]):.2f}", point[0])
 
 
-def _inside(kind: str, content: bytes) -> str:
+def _data_url(kind: str, content: bytes) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _image(kind: str, content: bytes, alt: str, caption: str) -> Html:
-    shown = Html(f'<img alt="{escaped(alt)}" src="{_inside(kind, content)}">')
+    shown = Html(f'<img alt="{escape(alt)}" src="{_data_url(kind, content)}">')
     return element("figure", shown, *([element("figcaption", caption)] if caption else []))

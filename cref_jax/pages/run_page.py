@@ -1,6 +1,6 @@
-"""The page of a run: what its folder holds, for people. Nothing of it needs a device.
+"""The page of a run: the contents of its folder for human readers. It needs no JAX device.
 
-What is missing or damaged leaves its section out, with a line that says how to get it.
+A section whose data is missing or damaged holds a note with the command that creates the data.
 """
 
 import dataclasses
@@ -17,30 +17,28 @@ from cref_jax.pages import evaluation_page, learning_charts, markup, training_lo
 from cref_jax.pages.markup import MISSING, Column, Html, Section, code, join, note, paragraph
 from cref_jax.pages.training_log import Log
 
-MOST_MEDIA = (
-    60 * markup.MEGABYTE
-)  # bytes of all pictures and films of one page; assumed: as MOST_VIDEO
+MOST_MEDIA = 60 * markup.MEGABYTE  # bytes of all images and videos per page; assumed: as MOST_VIDEO
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy", "python")
 
 Settings = dict[str, Any]
 
 
 class Run(NamedTuple):
-    """What the folder of a run holds."""
+    """The contents of a run's folder."""
 
     folder: Path
     settings: Settings  # config.json, nested
     starts: tuple[dict[str, Any], ...]  # origin.jsonl
     log: Log | None
-    no_log: str  # why there is none
+    no_log: str  # why the log is missing
     checkpoints: tuple[int, ...]  # iterations
 
 
 def read(folder: Path) -> Run:
-    """Return what is known about a run.
+    """Read the settings, the starts, the log and the checkpoint numbers of a run.
 
     Raises:
-        ConfigError: it is none: there is no config.json that can be read.
+        ConfigError: config.json is missing or unreadable.
     """
     path = folder / "config.json"
     try:
@@ -50,67 +48,68 @@ def read(folder: Path) -> Run:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {error}") from None
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path} holds no settings")
-    log, why = None, ""
+        raise ConfigError(f"{path} has no settings")
+    log, reason = None, ""
     try:
         log = training_log.read(folder / "log.jsonl")
     except ConfigError as error:
-        why = str(error)
+        reason = str(error)
     steps = sorted(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdecimal())
-    return Run(folder, settings, tuple(_starts(folder)), log, why, tuple(steps))
+    return Run(folder, settings, tuple(_read_starts(folder)), log, reason, tuple(steps))
 
 
 def document(run: Run) -> str:
-    """Return the page of a run."""
+    """Build the page of a run."""
     sections = [
-        Section("What it is", _overview(run)),
-        *_evaluations(run),
-        Section("Pictures and films", _media(run.folder)),
-        *_learning(run),
-        Section("Where it comes from", provenance(run.starts)),
-        Section("Settings", settings(run.settings)),
+        Section("Overview", _overview_list(run)),
+        *_evaluation_sections(run),
+        Section("Images and videos", _media_body(run.folder)),
+        *_learning_sections(run),
+        Section("Provenance", provenance_body(run.starts)),
+        Section("Settings", settings_body(run.settings)),
     ]
-    return markup.document(f"Run {run.folder.resolve().name}", _lead(run), sections, foot())
+    return markup.document(f"Run {run.folder.resolve().name}", _make_tiles(run), sections, footer())
 
 
-def foot() -> str:
-    """Return when a page was written."""
+def footer() -> str:
+    """Format the time at which the page is written."""
     now = datetime.datetime.now(datetime.UTC)
     return f"Written by cref_jax on {now:%Y-%m-%d at %H:%M} UTC."
 
 
-def settings(given: Settings) -> Html:
-    """Return the settings that differ from the defaults, and all of them on a click."""
-    ours, defaults = _flat(given), _flat(json.loads(json.dumps(dataclasses.asdict(Config()))))
-    names = list(dict.fromkeys([*defaults, *ours]))
-    changed = [name for name in names if ours.get(name) != defaults.get(name)]
+def settings_body(settings: Settings) -> Html:
+    """Build the table of settings that differ from the defaults and, collapsed, that of all."""
+    current = _flatten(settings)
+    defaults = _flatten(json.loads(json.dumps(dataclasses.asdict(Config()))))
+    names = list(dict.fromkeys([*defaults, *current]))
+    changed = [name for name in names if current.get(name) != defaults.get(name)]
     shown = lambda values, name: json.dumps(values[name]) if name in values else MISSING
-    columns = [Column("setting"), Column("here"), Column("default")]
-    rows = [(code(name), shown(ours, name), shown(defaults, name)) for name in changed]
-    everything = [(code(name), json.dumps(value)) for name, value in ours.items()]
+    columns = [Column("setting"), Column("value"), Column("default")]
+    rows = [(code(name), shown(current, name), shown(defaults, name)) for name in changed]
+    everything = [(code(name), json.dumps(value)) for name, value in current.items()]
     return join(
-        paragraph("These settings differ from the defaults, which are the paper's.")
+        paragraph("These settings differ from the defaults (the paper's values).")
         if changed
-        else paragraph("Every setting is the default, which is the paper's."),
+        else paragraph("All settings have their defaults (the paper's values)."),
         markup.table(columns, rows) if changed else Html(),
-        markup.folded(f"All {len(ours)} settings", markup.table(columns[:2], everything)),
+        markup.collapsible(f"All {len(current)} settings", markup.table(columns[:2], everything)),
     )
 
 
-def provenance(starts: tuple[Mapping[str, Any], ...]) -> Html:
-    """Return when, how and with what a run was started."""
+def provenance_body(starts: tuple[Mapping[str, Any], ...]) -> Html:
+    """Build the table of starts: time, command, device, commit and package versions."""
     if not starts:
-        return note("It is not known: origin.jsonl is missing or empty.")
-    columns = [Column("start"), Column("done before", True), Column("command")]
+        return note("Unknown: origin.jsonl is missing or empty.")
+    columns = [Column("start"), Column("iterations before", True), Column("command")]
     columns += [Column("device"), Column("cores", True), Column("git")]
     rows = [
         (
-            moment(start.get("time")),
-            _count(start.get("iteration")),
-            code(_command(start.get("command"))),
+            format_time(start.get("time")),
+            _format_count(start.get("iteration")),
+            code(_format_command(start.get("command"))),
             str(start.get("device", MISSING)),
             str(start.get("cores", MISSING)),
-            _git(start.get("git")),
+            _format_commit(start.get("git")),
         )
         for start in starts
     ]
@@ -119,30 +118,31 @@ def provenance(starts: tuple[Mapping[str, Any], ...]) -> Html:
         for name in PACKAGES
         if any(name in start for start in starts)
     ]
-    made_by = paragraph(f"Versions: {'; '.join(versions)}.") if versions else Html()
-    return join(markup.table(columns, rows), made_by)
+    used = paragraph(f"Versions: {'; '.join(versions)}.") if versions else Html()
+    return join(markup.table(columns, rows), used)
 
 
-def evaluation(record: Any, source: str, iteration: int | None = None) -> Html:
-    """Return an evaluation inside of another page; `iteration` is the newest of its run."""
+def evaluation_body(record: Any, source: str, iteration: int | None = None) -> Html:
+    """Build an evaluation as part of another page; `iteration` is the run's latest checkpoint."""
     try:
         if not isinstance(record, dict):
-            raise ConfigError("this evaluation is no table of values")
-        shown = [evaluation_page.lead(record), markup.nested(evaluation_page.sections(record))]
+            raise ConfigError("this evaluation is not a JSON object")
+        shown = [evaluation_page.lead(record), markup.subsections(evaluation_page.sections(record))]
     except ConfigError as error:
         return note(code(source), f": {error}.")
-    of = record.get("iteration")
-    if iteration is not None and isinstance(of, int) and of < iteration:
-        shown.insert(0, note(f"It is of iteration {of:,}; the run has come to {iteration:,}."))
+    measured = record.get("iteration")
+    if iteration is not None and isinstance(measured, int) and measured < iteration:
+        text = f"Measured at iteration {measured:,}; the latest checkpoint is {iteration:,}."
+        shown.insert(0, note(text))
     return join(*shown)
 
 
-def moment(iso: Any) -> str:
-    """Return a time as people write it."""
+def format_time(iso: Any) -> str:
+    """Format an ISO 8601 time for human readers."""
     return str(iso or MISSING).replace("T", " ").replace("+00:00", " UTC")
 
 
-def _starts(folder: Path) -> Iterator[dict[str, Any]]:
+def _read_starts(folder: Path) -> Iterator[dict[str, Any]]:
     try:
         lines = (folder / "origin.jsonl").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -156,65 +156,66 @@ def _starts(folder: Path) -> Iterator[dict[str, Any]]:
             yield start
 
 
-def _lead(run: Run) -> Html:
-    """Return the few figures of a run."""
+def _make_tiles(run: Run) -> Html:
+    """Build the tiles with the headline figures of a run."""
     if run.log is None:
         return Html()
     log = run.log
-    of = _of(run.settings, "run", "iterations")
-    values = [(f"{int(log['iteration'][-1]):,}", f"iterations of {_count(of)}")]
+    of = _look_up(run.settings, "run", "iterations")
+    values = [(f"{int(log['iteration'][-1]):,}", f"iterations of {_format_count(of)}")]
     if "train/samples" in log:
         values.append((f"{log['train/samples'][-1] / 1e6:.1f} M", "samples"))
         if "samples_per_s" in log:
-            values.append((_duration(float(log.minutes()[-1])), "of training"))
-    return markup.tiles([*values, *learning_charts.newest(log)])
+            values.append((_format_duration(float(log.minutes()[-1])), "of training"))
+    return markup.tiles([*values, *learning_charts.latest_values(log)])
 
 
-def _overview(run: Run) -> Html:
-    """Return what kind of run it is and how far it has come."""
-    of = lambda *path: _of(run.settings, *path)
+def _overview_list(run: Run) -> Html:
+    """Build the list of a run's main settings, its progress and its checkpoints."""
+    of = lambda *path: _look_up(run.settings, *path)
     values = [
         ("folder", code(str(run.folder))),
-        ("terrain", _text(of("terrain", "name"))),
-        ("network", _text(of("network", "variant"))),
-        ("robots at once", _count(of("run", "num_envs"))),
-        ("seed", _text(of("run", "seed"))),
-        ("state", _state(run)),
+        ("terrain", _format_text(of("terrain", "name"))),
+        ("network", _format_text(of("network", "variant"))),
+        ("parallel robots", _format_count(of("run", "num_envs"))),
+        ("seed", _format_text(of("run", "seed"))),
+        ("state", _describe_progress(run)),
     ]
     if run.checkpoints:
         values.append(("checkpoints", ", ".join(f"{step:,}" for step in run.checkpoints)))
-    return markup.pairs(values)
+    return markup.definition_list(values)
 
 
-def _state(run: Run) -> str:
-    """Return whether the run is finished."""
-    total = _of(run.settings, "run", "iterations")
+def _describe_progress(run: Run) -> str:
+    """Describe the progress of the run in words."""
+    total = _look_up(run.settings, "run", "iterations")
     if run.log is None or not isinstance(total, int):
-        return "nothing is logged yet"
+        return "nothing logged yet"
     done = int(run.log["iteration"][-1])
     seconds = (run.folder / "log.jsonl").stat().st_mtime
     last = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
-    when = f"the log's last line is of {last:%Y-%m-%d %H:%M} UTC"
+    when = f"last logged at {last:%Y-%m-%d %H:%M} UTC"
     if done >= total:
         return f"finished: {done:,} of {total:,} iterations; {when}"
     return f"stopped or still training: {done:,} of {total:,} iterations; {when}"
 
 
-def _learning(run: Run) -> Iterator[Section]:
+def _learning_sections(run: Run) -> Iterator[Section]:
     if run.log is None:
-        words = note(f"{run.no_log}. Training writes it: ", _make("train", run.folder, "--resume"))
-        yield Section("Learning curves", words)
+        command = _make_command("train", run.folder, "--resume")
+        missing = note(f"{run.no_log}. Training writes it: ", command)
+        yield Section("Learning curves", missing)
         return
     done = [start.get("iteration") for start in run.starts[1:]]
     marks = sorted({*run.log.repeated, *(i + 1 for i in done if isinstance(i, int))})
-    target = _of(run.settings, "ppo", "target_kl")
+    target = _look_up(run.settings, "ppo", "target_kl")
     yield from learning_charts.sections(
         run.log, marks, float(target) if isinstance(target, int | float) else None, len(run.starts)
     )
 
 
-def _evaluations(run: Run) -> Iterator[Section]:
-    """Return the newest evaluation of each suite."""
+def _evaluation_sections(run: Run) -> Iterator[Section]:
+    """Yield the newest evaluation of each suite."""
     shown, older = {}, []
     files = sorted(run.folder.glob("eval*.json"), key=lambda p: (-p.stat().st_mtime, p.name))
     for path in files:
@@ -232,40 +233,42 @@ def _evaluations(run: Run) -> Iterator[Section]:
     order += [suite for suite in shown if suite not in order]
     for name, record in map(shown.__getitem__, order):
         title = evaluation_page.title(record) if isinstance(record, dict) else name
-        yield Section(title, evaluation(record, name, newest))
+        yield Section(title, evaluation_body(record, name, newest))
     if older:
         yield Section("Older evaluations", paragraph(", ".join(older)))
     if not shown:
-        words = note("There is none yet: ", _make("eval", run.folder, "--suite table"))
-        yield Section("Evaluation", words)
+        command = _make_command("eval", run.folder, "--suite table")
+        missing = note("No evaluation yet. Run ", command)
+        yield Section("Evaluation", missing)
 
 
-def _media(folder: Path) -> Html:
-    """Return the pictures and films of the folder, the newest first, while there is room."""
+def _media_body(folder: Path) -> Html:
+    """Embed the images and videos of the folder, newest first, within `MOST_MEDIA` bytes."""
     kinds = (".png", ".mp4")
     files = [p for p in folder.iterdir() if p.suffix.lower() in kinds and p.is_file()]
     files.sort(key=lambda p: (-p.stat().st_mtime, p.name))
     left, shown = MOST_MEDIA, []
     for path in files:
-        film = path.suffix.lower() == ".mp4"
-        most = min(left, markup.MOST_VIDEO if film else markup.MOST_PICTURE)
+        is_video = path.suffix.lower() == ".mp4"
+        most = min(left, markup.MOST_VIDEO if is_video else markup.MOST_PICTURE)
         shown.append(markup.media(path, most))
         size = path.stat().st_size
         left -= size if size <= most else 0
     if not any(path.suffix.lower() == ".mp4" for path in files):
-        shown.append(note("There is no film of it yet: ", _make("play", folder)))
+        shown.append(note("No video yet. Run ", _make_command("play", folder)))
     return join(*shown)
 
 
-def _make(target: str, folder: Path, *more: str) -> Html:
-    """Return the command that makes what is missing."""
+def _make_command(target: str, folder: Path, *more: str) -> Html:
+    """Format the `make` command that creates missing data of the run."""
     option = "--run-dir" if target == "train" else "--run"
-    words = " ".join((option, shlex.quote(str(folder)), *more))
-    return code(f"make {target} ARGS={shlex.quote(words) if chr(39) in words else repr(words)}")
+    options = " ".join((option, shlex.quote(str(folder)), *more))
+    quoted = shlex.quote(options) if chr(39) in options else repr(options)
+    return code(f"make {target} ARGS={quoted}")
 
 
-def _command(words: Any) -> str:
-    """Return a command line as it is typed, without the folders of another machine."""
+def _format_command(words: Any) -> str:
+    """Format a recorded command line without the folder of its program."""
     if not isinstance(words, list) or not words:
         return MISSING
     program, *rest = map(str, words)
@@ -274,37 +277,37 @@ def _command(words: Any) -> str:
     return " ".join((start, *map(shlex.quote, rest)))
 
 
-def _git(state: Any) -> Html:
+def _format_commit(state: Any) -> Html:
     if not isinstance(state, str) or not state:
         return Html("unknown")
     commit = state.removesuffix("+")
     return join(code(commit[:12]), " with changes" if state.endswith("+") else "")
 
 
-def _flat(nested: Settings, before: str = "") -> Settings:
-    """Return nested settings under dotted names."""
+def _flatten(nested: Settings, before: str = "") -> Settings:
+    """Flatten nested settings to dotted names."""
     flat: Settings = {}
     for name, value in nested.items():
         path = f"{before}{name}"
-        flat |= _flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
+        flat |= _flatten(value, f"{path}.") if isinstance(value, dict) else {path: value}
     return flat
 
 
-def _of(settings: Settings, *path: str) -> Any:
+def _look_up(settings: Settings, *path: str) -> Any:
     value: Any = settings
     for name in path:
         value = value.get(name) if isinstance(value, dict) else None
     return value
 
 
-def _text(value: Any) -> str:
+def _format_text(value: Any) -> str:
     return MISSING if value is None else str(value)
 
 
-def _count(value: Any) -> str:
-    return f"{value:,}" if isinstance(value, int) else _text(value)
+def _format_count(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int) else _format_text(value)
 
 
-def _duration(minutes: float) -> str:
+def _format_duration(minutes: float) -> str:
     whole = round(minutes)
     return f"{whole // 60} h {whole % 60} min" if whole >= 60 else f"{whole} min"

@@ -1,8 +1,8 @@
-"""What a run's log says over time: read, made smooth and thinned out.
+"""Reading, smoothing and thinning of a run's training log.
 
-runs/NAME/log.jsonl has one JSON object an iteration. A run that is resumed after a crash trains the
-iterations since its checkpoint again, and its log holds them twice: the later ones count. A line
-that a power cut has damaged is skipped.
+runs/NAME/log.jsonl holds one JSON object per iteration. A run resumed after a crash repeats the
+iterations since its checkpoint, so its log holds them twice: the later ones count. A line damaged
+by a power cut is skipped.
 """
 
 import json
@@ -17,42 +17,42 @@ from jaxtyping import Float, Int
 
 from cref_jax.errors import ConfigError
 
-WEIGHTS = {  # measures of the episodes that ended in an iteration, which says 0 if none did
+WEIGHTS = {  # averages over the episodes that ended in an iteration; logged as 0 without any
     "episode/length_s": "episode/ended",
-    "fell/": "episode/ended",  # of all kinds; a log does not hold the number of each
+    "fell/": "episode/ended",  # all kinds: the log has no count per kind
 }
 
 
 class Log(NamedTuple):
-    """A log as columns of N iterations; NaN where a line does not hold the value."""
+    """A log as columns of N iterations; NaN where a line lacks the value."""
 
     columns: dict[str, Float[np.ndarray, " N"]]
-    repeated: tuple[int, ...]  # iterations from which on the run was trained again
-    damaged: int  # lines that could not be read
+    repeated: tuple[int, ...]  # first iteration of each repeated stretch
+    damaged: int  # unreadable lines
 
     def __getitem__(self, name: str) -> Float[np.ndarray, " N"]:
         """Return a column."""
         return self.columns[name]
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is such a column."""
+        """Return whether the column exists."""
         return name in self.columns
 
     def minutes(self) -> Float[np.ndarray, " N"]:
-        """Return how long it had been trained after each iteration, without pauses."""
+        """Compute the training time up to each iteration, without pauses, min."""
         samples = np.diff(self["train/samples"], prepend=0.0)
         return np.nancumsum(np.maximum(samples, 0.0) / self["samples_per_s"]) / 60.0
 
 
 def read(path: Path) -> Log:
-    """Return a log.
+    """Read a log.
 
     Raises:
-        ConfigError: there is no such file, or no whole line in it.
+        ConfigError: the file is missing or unreadable, or it has no whole line.
     """
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            log = _columns(file)
+            log = _parse_lines(file)
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     if not log.columns:
@@ -61,9 +61,9 @@ def read(path: Path) -> Log:
 
 
 def smooth(log: Log, name: str, window: int) -> Float[np.ndarray, " N"]:
-    """Return each iteration's mean with the `window` - 1 before it, NaN where none has a value.
+    """Compute the mean over each iteration and the `window` - 1 before it, NaN without values.
 
-    Measures of episodes are weighted by the number of episodes that ended.
+    Averages over episodes are weighted by the number of episodes that ended.
     """
     by = next((w for key, w in WEIGHTS.items() if name.startswith(key) and w in log), None)
     weights = np.nan_to_num(log[by]) if by else np.ones_like(log[name])
@@ -71,21 +71,21 @@ def smooth(log: Log, name: str, window: int) -> Float[np.ndarray, " N"]:
     weights = np.where(known, weights, 0.0)
     total = _moving_sum(weights * np.where(known, log[name], 0.0), window)
     weight = _moving_sum(weights, window)
-    there = weight > 0.5  # weights are counts, and sums of floats leave a rest
-    return np.where(there, total / np.where(there, weight, 1.0), np.nan)
+    has_value = weight > 0.5  # weights are counts; differences of float sums are inexact
+    return np.where(has_value, total / np.where(has_value, weight, 1.0), np.nan)
 
 
-def thinned(count: int, most: int) -> Int[np.ndarray, " M"]:
-    """Return at most `most` of `count` places, evenly, the first and the last among them."""
+def even_indices(count: int, most: int) -> Int[np.ndarray, " M"]:
+    """Compute at most `most` evenly spaced indices below `count`, both ends included."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def _columns(lines: Iterable[str]) -> Log:
-    """Return the columns of a log's lines."""
+def _parse_lines(lines: Iterable[str]) -> Log:
+    """Parse the lines of a log into columns; repeated iterations replace the earlier ones."""
     columns: dict[str, array[float]] = {"iteration": array("d")}
     iterations, damaged, repeated = columns["iteration"], 0, []
     for line in lines:
-        row = _row(line)
+        row = _parse_line(line)
         if row is None:
             damaged += 1
             continue
@@ -109,8 +109,8 @@ def _columns(lines: Iterable[str]) -> Log:
     return Log(whole, tuple(repeated), damaged)
 
 
-def _row(line: str) -> dict[str, Any] | None:
-    """Return a line's values, or None where it is damaged."""
+def _parse_line(line: str) -> dict[str, Any] | None:
+    """Parse the values of a line; None if it is damaged."""
     try:
         row = json.loads(line)
         return row if np.isfinite(row["iteration"]) else None
@@ -119,7 +119,7 @@ def _row(line: str) -> dict[str, Any] | None:
 
 
 def _moving_sum(values: Float[np.ndarray, " N"], window: int) -> Float[np.ndarray, " N"]:
-    """Return the sum of each value and the `window` - 1 before it."""
+    """Compute the sum of each value and the `window` - 1 before it."""
     total = np.cumsum(values)
     total[window:] -= total[:-window].copy()
     return total

@@ -1,4 +1,4 @@
-"""What every physics engine takes and returns."""
+"""Inputs and outputs of every physics engine."""
 
 from typing import Literal, NamedTuple, Protocol
 
@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 
 class Dynamics(NamedTuple):
-    """What differs from one robot to the next; drawn anew at each reset."""
+    """Randomised parameters of one robot, sampled at each reset."""
 
     friction: Float[Array, ""]  # sliding friction coefficient
     payload: Float[Array, ""]  # kg added to the trunk
@@ -15,8 +15,20 @@ class Dynamics(NamedTuple):
     kd: Float[Array, " J"]  # N m s / rad
 
 
+class SubstepInput(NamedTuple):
+    """The state of one robot, what its motors aim at, and the planes that it touches."""
+
+    qpos: Float[Array, " Q"]  # m, quaternion, rad
+    qvel: Float[Array, " V"]  # m/s, rad/s
+    warmstart: Float[Array, " V"]  # the solver's last acceleration
+    target: Float[Array, " M"]  # rad, of all joints that move
+    plane_position: Float[Array, "P 3"]  # m
+    plane_rotation: Float[Array, "P 4"]  # quaternion w, x, y, z
+    dynamics: Dynamics
+
+
 class Substep(NamedTuple):
-    """What a physics substep returns."""
+    """The result of a physics substep."""
 
     qpos: Float[Array, " Q"]  # m, quaternion, rad
     qvel: Float[Array, " V"]  # m/s, rad/s
@@ -37,17 +49,8 @@ class Body(NamedTuple):
 
 
 class Engine(Protocol):
-    """Advances one robot by one substep; `jax.vmap` gives many."""
+    """Advances one robot by one substep; batch it with `jax.vmap`."""
 
-    def substep(
-        self,
-        qpos: Float[Array, " Q"],
-        qvel: Float[Array, " V"],
-        warmstart: Float[Array, " V"],
-        target: Float[Array, " M"],
-        plane_position: Float[Array, "P 3"],
-        plane_rotation: Float[Array, "P 4"],
-        dynamics: Dynamics,
-    ) -> Substep:
-        """Return the state one substep on."""
+    def substep(self, robot: SubstepInput) -> Substep:
+        """Advance one robot by one substep."""
         ...

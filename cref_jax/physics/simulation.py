@@ -1,8 +1,8 @@
 """The physics step, with terrain contact by tangent planes (Sec. II-D).
 
-Each contact sphere owns a plane. Before every substep the terrain is asked for the surface point
-and normal nearest to the sphere, and the plane is put there. The engine sees only planes against
-spheres: one contact a plane, at constant cost, the same in every engine.
+Each contact sphere owns a plane. Before every substep the plane is moved to the surface point
+nearest to the sphere, along the normal there. The engine sees only planes against spheres: one
+contact per plane, at constant cost, the same in every engine.
 """
 
 import importlib.util
@@ -15,15 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cref_jax import config, geometry, robot, terrain
 from cref_jax.physics.mjx_engine import MjxEngine, WarpEngine
-from cref_jax.physics.mujoco_engine import HostEngine
-from cref_jax.physics.records import Backend, Body, Dynamics, Engine, EngineName
+from cref_jax.physics.mujoco_engine import MujocoEngine
+from cref_jax.physics.records import Backend, Body, Dynamics, Engine, EngineName, SubstepInput
 from cref_jax.robot import kinematics
 
-MAX_DEPTH = 0.05  # m; a foot that swings at 8 m/s is 4 cm in a wall after one substep
+MAX_DEPTH = 0.05  # m; a foot swinging at 8 m/s is 4 cm inside a wall after one substep
 
 
 class Physics:
-    """One robot on one terrain: what does not change while it is simulated."""
+    """One robot's model and engine, which stay constant during a simulation."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class Physics:
         engine: Backend,
         threads: int = 0,
     ) -> None:
-        """Compile the model and make the engine; `threads` is for MuJoCo C, 0 means all cores.
+        """Compile the model and create the engine; `threads` for MuJoCo C, 0: all cores.
 
         Raises:
             ConfigError: the engine is not installed.
@@ -46,20 +46,20 @@ class Physics:
             robot.add_force_sensors(spec, name)
         if engine == "mujoco":
             robot.solve_sparsely(spec)
-        if engine == "warp":  # it never resets a state by itself, and takes no flag against it
+        if engine == "warp":  # it never resets a state itself and rejects the flag
             spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.model = spec.compile()
         self.tree = kinematics.tree(self.model)
         self.engine: Engine
         if engine == "mujoco":
-            self.engine = HostEngine(self.model, self.robot.trunk, threads)
+            self.engine = MujocoEngine(self.model, self.robot.trunk, threads)
         elif engine == "warp":
             self.engine = WarpEngine(self.model, self.robot.trunk)
         else:
             self.engine = MjxEngine(self.model, self.robot.trunk, self.feet)
 
     def nominal_dynamics(self) -> Dynamics:
-        """Return the dynamics of the robot as it is, on nominal ground."""
+        """Return the dynamics of the nominal robot on nominal ground."""
         return Dynamics(
             friction=jnp.float32(robot.FRICTION),
             payload=jnp.float32(0.0),
@@ -69,16 +69,16 @@ class Physics:
         )
 
     def links(self, body: Body) -> kinematics.Links:
-        """Return the pose and velocity of every link."""
+        """Compute the pose and velocity of every link."""
         return kinematics.links(self.tree, body.qpos, body.qvel)
 
     def planes(
         self, ground: terrain.Terrain, body: Body
     ) -> tuple[Float[Array, "P 3"], Float[Array, "P 4"]]:
-        """Return position and rotation of the terrain's tangent plane under each sphere.
+        """Compute position and rotation of the terrain's tangent plane under each sphere.
 
-        A plane is never more than `MAX_DEPTH` above its sphere's centre: a sphere that was thrown
-        deep into a wall comes out at the speed of a collision and not of an explosion.
+        A plane is at most `MAX_DEPTH` above its sphere's centre: a sphere thrown deep into a wall
+        comes out at the speed of a collision, not of an explosion.
         """
         spheres = self.robot.spheres
         centres = kinematics.points(self.links(body), spheres.body, spheres.position)
@@ -87,9 +87,9 @@ class Physics:
         return point, jax.vmap(geometry.quat_from_z)(normal)
 
     def is_hit(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, ""]:
-        """Return whether an end of pelvis, torso, head or a thigh touches the ground.
+        """Check whether an end of pelvis, torso, head or a thigh touches the ground.
 
-        A wall ahead is noticed from as far as `closest_point` looks.
+        Walls are detected within the search distance of `closest_point`.
         """
         capsules = self.robot.capsules
         clear = capsules.kept_clear
@@ -110,13 +110,14 @@ class Physics:
         """Advance one control step; return the state and the mean force on each foot, N.
 
         `targets` are the previous and the new joint targets, rad; the new one arrives after `delay`
-        substeps. The joints that are held keep theirs.
+        substeps. Joints held by the robot keep their rest pose.
         """
         held = jnp.asarray(self.robot.rest_pose[len(self.robot.nominal_pose) :])
 
         def substep(body: Body, k: Int[Array, ""]) -> tuple[Body, Float[Array, "F 3"]]:
             target = jnp.concatenate([jnp.where(k < delay, targets[0], targets[1]), held])
-            after = self.engine.substep(*body, target, *self.planes(ground, body), dynamics)
+            planes = self.planes(ground, body)
+            after = self.engine.substep(SubstepInput(*body, target, *planes, dynamics))
             return Body(after.qpos, after.qvel, after.warmstart), after.force
 
         body, force = jax.lax.scan(substep, body, jnp.arange(self.config.substeps))
@@ -124,9 +125,9 @@ class Physics:
 
 
 def resolve_engine(name: EngineName) -> Backend:
-    """Return the engine for this machine: MuJoCo C on a CPU, MuJoCo Warp or MJX on a GPU.
+    """Select the engine for this machine: MuJoCo C on a CPU, MuJoCo Warp or MJX on a GPU.
 
-    Warp makes twice the samples per second of MJX. On several GPUs it is untried, and MJX is taken.
+    Warp gives twice the samples per second of MJX. It is untested on several GPUs; they use MJX.
     """
     if name != "auto":
         return name

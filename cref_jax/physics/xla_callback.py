@@ -1,9 +1,9 @@
-"""A Python function as an XLA custom call, which a compiled program knows by its name alone.
+"""Python functions as XLA custom calls, which a compiled program refers to by name alone.
 
-`jax.pure_callback` writes the address of the function into the program, so that JAX never keeps
-such a program in its cache on disk: half a minute of compilation at every start. A custom call is
-looked up by name when the program is loaded. The structures are those of XLA's stable C interface
-for foreign functions, `xla/ffi/api/c_api.h`; only a CPU can call into Python.
+`jax.pure_callback` writes the address of the function into the program, so JAX never stores such a
+program in its cache on disk: half a minute of compilation at every start. A custom call is looked
+up by name when the program is loaded. The structures mirror XLA's stable C interface for foreign
+functions, `xla/ffi/api/c_api.h`; only a CPU can call into Python.
 """
 
 import atexit
@@ -19,11 +19,11 @@ from jaxtyping import Array, Shaped
 
 HostFunction = Callable[[list[np.ndarray], list[np.ndarray]], None]
 
-_METADATA = 1  # type of the extension by which XLA asks for the version of the interface
+_METADATA = 1  # type of the extension with which XLA queries the interface version
 _EXECUTE = 3  # stage of a call
 _INTERNAL = 13  # error code
 _DTYPES = {1: np.bool_, 4: np.int32, 8: np.uint32, 11: np.float32, 12: np.float64}
-_kept: list[Any] = []  # what XLA has the address of must live as long as the process
+_keep_alive: list[Any] = []  # handlers whose addresses XLA holds until the process ends
 
 
 class _Version(ctypes.Structure):
@@ -101,61 +101,61 @@ class _CallFrame(ctypes.Structure):
 
 
 def register(name: str, function: HostFunction) -> None:
-    """Make `function(arguments, results)` callable by `name`, once a process.
+    """Make `function(arguments, results)` callable by `name`; call this once per process.
 
     It reads the arguments and fills the results, both views of XLA's own memory that must not
-    outlive the call. What it raises fails the program that called it.
+    outlive the call. An exception fails the calling program.
     """
 
     def handle(address: int) -> int:
         frame = _CallFrame.from_address(address)
         if frame.extension and frame.extension.contents.type == _METADATA:
-            asked, own = frame.extension.contents.metadata.contents.version, frame.api.contents
-            asked.major, asked.minor = own.version.major, own.version.minor
+            requested, own = frame.extension.contents.metadata.contents.version, frame.api.contents
+            requested.major, requested.minor = own.version.major, own.version.minor
         elif frame.stage == _EXECUTE:
             try:
-                function(_arrays(frame.arguments), _arrays(frame.results))
+                function(_view_buffers(frame.arguments), _view_buffers(frame.results))
             except Exception as error:
-                return _failure(frame.api.contents, f"{type(error).__name__}: {error}")
+                return _make_error(frame.api.contents, f"{type(error).__name__}: {error}")
         return 0
 
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(handle)
-    _kept.append(handler)
+    _keep_alive.append(handler)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
 
 
 def call(
     name: str, results: Sequence[jax.ShapeDtypeStruct], *arguments: Shaped[Array, "..."]
 ) -> tuple[Shaped[Array, "..."], ...]:
-    """Call the function of that name; under vmap all arrays get the batch's leading axes."""
+    """Call the function `name`; under vmap all arrays get the batch's leading axes."""
     return tuple(jax.ffi.ffi_call(name, tuple(results), vmap_method="broadcast_all")(*arguments))
 
 
 @atexit.register
-def _wait() -> None:
-    """Let programs end before the interpreter does: a call after that would wait for ever."""
+def _wait_for_programs() -> None:
+    """Wait for programs before the interpreter exits: a later call would hang forever."""
     for array in jax.live_arrays():
-        with contextlib.suppress(Exception):  # why it failed is of no interest any more
+        with contextlib.suppress(Exception):  # failures no longer matter at exit
             array.block_until_ready()
 
 
-def _arrays(buffers: _Buffers) -> list[np.ndarray]:
-    """Return views of the buffers' memory."""
-    found = []
+def _view_buffers(buffers: _Buffers) -> list[np.ndarray]:
+    """Create array views of the buffers' memory."""
+    views = []
     for k in range(buffers.size):
         buffer = buffers.values[k].contents
         shape = tuple(buffer.dims[axis] for axis in range(buffer.rank))
         dtype = np.dtype(_DTYPES[buffer.dtype])
         size = dtype.itemsize * math.prod(shape)
         if not size:
-            found.append(np.empty(shape, dtype))
+            views.append(np.empty(shape, dtype))
             continue
         memory = (ctypes.c_char * size).from_address(buffer.data)
-        found.append(np.ndarray(shape, dtype, memory))
-    return found
+        views.append(np.ndarray(shape, dtype, memory))
+    return views
 
 
-def _failure(api: _Api, message: str) -> int:
-    """Return XLA's own error with this message."""
+def _make_error(api: _Api, message: str) -> int:
+    """Create XLA's own error with this message."""
     error = _ErrorCreate(ctypes.sizeof(_ErrorCreate), None, message.encode(), _INTERNAL)
     return api.error_create(ctypes.addressof(error)) or 0

@@ -1,6 +1,6 @@
-"""All that a training has learned as one file, without its robots: to go on with elsewhere.
+"""The complete learner in one file, without the robots, to continue training elsewhere.
 
-A checkpoint of thousands of robots is hundreds of megabytes, and what they have learned is ten.
+A checkpoint with thousands of robots takes hundreds of megabytes; the learner takes ten.
 """
 
 import dataclasses
@@ -18,19 +18,19 @@ from cref_jax.errors import ConfigError
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import iteration, pytree_digest
 
-_SETTINGS, _ITERATION = "settings", "iterations"  # names that no leaf has
+_SETTINGS, _ITERATION = "settings", "iterations"  # not the name of any leaf
 
 
 def is_learner(path: Path) -> bool:
-    """Return whether the name is that of such a file."""
+    """Check whether the file name is that of a learner file."""
     return path.suffix == ".npz"
 
 
 def write(policy: TrainedPolicy, out: Path) -> None:
-    """Write actor, critic, optimiser and statistics, and the settings of the run.
+    """Write actor, critic, optimiser, statistics and the settings of the run.
 
     Raises:
-        ConfigError: the disk refused.
+        ConfigError: the file cannot be written.
     """
     arrays = pytree_digest.on_host(policy.train)
     arrays[_SETTINGS] = np.array(json.dumps(dataclasses.asdict(policy.config)))
@@ -44,21 +44,21 @@ def write(policy: TrainedPolicy, out: Path) -> None:
 
 
 def read_config(path: Path) -> Config:
-    """Return the settings of the run that learned this.
+    """Read the settings of the run that wrote the file.
 
     Raises:
-        ConfigError: it is no such file, or of another version of the program.
+        ConfigError: it is not a learner file, or from another version of the program.
     """
-    return config.override(Config(), json.loads(str(_arrays(path)[_SETTINGS])))
+    return config.override(Config(), json.loads(str(_load_arrays(path)[_SETTINGS])))
 
 
 def read(path: Path, world: World) -> TrainedPolicy:
-    """Return what was learned; `world` may have another terrain.
+    """Read the learner; `world` may have another terrain.
 
     Raises:
-        ConfigError: it is no such file, or the network is another one.
+        ConfigError: it is not a learner file, or its network differs.
     """
-    arrays, c = _arrays(path), read_config(path)
+    arrays, c = _load_arrays(path), read_config(path)
     like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
     for name, leaf in pytree_digest.by_path(like).items():
         if name not in arrays or arrays[name].shape != leaf.shape:
@@ -67,12 +67,12 @@ def read(path: Path, world: World) -> TrainedPolicy:
     return TrainedPolicy(c, pytree_digest.fill_from(like, placed), int(arrays[_ITERATION]), path)
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
+def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             arrays = dict(file)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigError(f"cannot read {path}: {error}") from None
     if missing := {_SETTINGS, _ITERATION} - arrays.keys():
-        raise ConfigError(f"{path} is not what export --learner writes: no {sorted(missing)[0]}")
+        raise ConfigError(f"{path} was not written by export --learner: no {sorted(missing)[0]}")
     return arrays

@@ -1,4 +1,4 @@
-"""The manifest of an exported policy: everything but the weights, with units and frames."""
+"""Manifest of an exported policy: everything but the weights, with units and frames."""
 
 import dataclasses
 import datetime
@@ -14,12 +14,12 @@ from cref_jax.env import observations
 from cref_jax.policy.trained import TrainedPolicy
 
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
-STALE = 0.1  # s, two frames of the camera
-MOST_INVALID = 0.5  # of a frame's pixels; assumed: beyond, the last frame tells more
+STALE = 0.1  # s, two camera frames
+MOST_INVALID = 0.5  # share of a frame's pixels; assumed: beyond it, the last frame tells more
 
 
 def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]:
-    """Return everything but the weights, without digests."""
+    """Build everything but the weights, without digests."""
     c = policy.config
     return {
         "format": "cref-policy",
@@ -30,7 +30,7 @@ def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]
             "frame_age_s": c.physics.control_period,
         },
         "joints": _joints(driven),
-        "held_joints": _held(c, driven),
+        "held_joints": _held_joints(c, driven),
         "action": _action(c),
         "observation": _observation(policy.train, driven),
         "command": _command(c),
@@ -44,7 +44,7 @@ def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]
 
 
 def _joints(driven: robot.Robot) -> list[dict[str, Any]]:
-    """Return the joints that the policy drives, in the order of every array."""
+    """List the joints that the policy drives, in the order of every array."""
     columns = {
         "default_rad": driven.nominal_pose,
         "action_scale_rad": driven.action_scale,
@@ -61,8 +61,8 @@ def _joints(driven: robot.Robot) -> list[dict[str, Any]]:
     ]
 
 
-def _held(c: Config, driven: robot.Robot) -> list[dict[str, Any]]:
-    """Return the joints that the robot itself has to hold at their default."""
+def _held_joints(c: Config, driven: robot.Robot) -> list[dict[str, Any]]:
+    """List the joints that the robot must hold at their default."""
     whole = robot.load(dataclasses.replace(c.robot, actuated="all"))
     keys = ("name", "default_rad", "kp", "kd", "effort_nm")
     return [
@@ -81,7 +81,7 @@ def _action(c: Config) -> dict[str, Any]:
 
 
 def _observation(train: ppo.TrainState, driven: robot.Robot) -> dict[str, Any]:
-    joints, statistics = len(driven.joint_names), train.statistics.obs
+    joints, statistics = driven.num_joints, train.statistics.obs
     return {
         "terms": [part._replace(size=part.size or joints)._asdict() for part in observations.PARTS],
         "formula": "clip((x - mean) / std, -clip, clip)",
@@ -92,7 +92,7 @@ def _observation(train: ppo.TrainState, driven: robot.Robot) -> dict[str, Any]:
 
 
 def _command(c: Config) -> dict[str, Any]:
-    """Return the commands that were trained, in the open and along lanes."""
+    """Compute the range of the trained commands, on open ground and along lanes."""
     turn = max(c.command.lane_yaw_rate, *map(abs, c.command.yaw_rate))
     forward = (*c.command.vx, *c.command.lane_vx)
     return {
@@ -152,9 +152,9 @@ def _state(c: config.Network) -> dict[str, Any]:
 
 
 def _guards(driven: robot.Robot) -> dict[str, Any]:
-    """Return the limits of the runtime; those on targets only take what the motors cannot do.
+    """Compute the runtime's limits; those on targets exclude only what the motors cannot do.
 
-    A target that is further from the pose than this asks for no more torque, at whatever speed.
+    A target further than this from the pose asks for no more torque, at any speed.
     """
     reach = [float(x) for x in (driven.effort + driven.kd * driven.velocity_limit) / driven.kp]
     return {
@@ -167,11 +167,13 @@ def _guards(driven: robot.Robot) -> dict[str, Any]:
 
 
 def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
-    """Return where the policy comes from; the last start of its run stands for all of them."""
+    """Describe the origin of the policy; the last start of its run represents all of them."""
     c, origin = policy.config, policy.run / "origin.jsonl"
     lines = origin.read_text().splitlines() if origin.is_file() else []
     start = json.loads(lines[-1]) if lines else {"command": []}
-    bare = lambda word: Path(word).name if Path(word).is_absolute() else word  # no one's folders
+    bare = lambda word: (
+        Path(word).name if Path(word).is_absolute() else word
+    )  # without private folders
     start["command"] = [bare(word) for word in start["command"]]
     return {
         "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -184,6 +186,6 @@ def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
 
 
 def _evaluation(run: Path) -> dict[str, Any] | None:
-    """Return what `make eval` has last said of the run."""
+    """Read the run's latest eval.json, if there is one."""
     path = run / "eval.json"
     return json.loads(path.read_text()) if path.is_file() else None

@@ -1,4 +1,4 @@
-"""An exported policy, read back to be evaluated in JAX."""
+"""Read an exported policy back, for evaluation in JAX."""
 
 import dataclasses
 import hashlib
@@ -19,7 +19,7 @@ from cref_jax.training import iteration, pytree_digest
 
 
 def read(path: Path, world: World | None = None) -> TrainedPolicy:
-    """Return an exported policy as one to evaluate in JAX; its critic is not in it, so it is zero.
+    """Load an exported policy for evaluation in JAX; the critic is not exported, so it is zero.
 
     Raises:
         ConfigError: it is not a policy that this program can read.
@@ -31,8 +31,8 @@ def read(path: Path, world: World | None = None) -> TrainedPolicy:
     actor = pytree_digest.fill_from(
         train.params.actor, {f"params/{k}": jnp.array(x) for k, x in arrays.items()}
     )
-    seen = content["observation"]
-    obs = train.statistics.obs.replace(mean=jnp.array(seen["mean"]), std=jnp.array(seen["std"]))
+    terms = content["observation"]
+    obs = train.statistics.obs.replace(mean=jnp.array(terms["mean"]), std=jnp.array(terms["std"]))
     train = train.replace(
         params=train.params._replace(actor=actor),
         statistics=train.statistics._replace(obs=obs),
@@ -40,22 +40,22 @@ def read(path: Path, world: World | None = None) -> TrainedPolicy:
     return TrainedPolicy(c, train, content["provenance"]["iteration"], path)
 
 
-def digest(policy: TrainedPolicy) -> str:
-    """Return the SHA-256 of all that decides what a policy does, the same for run and export."""
+def policy_digest(policy: TrainedPolicy) -> str:
+    """Compute the SHA-256 of all that determines a policy's actions, equal for run and export."""
     c = policy.config
     settings = [dataclasses.asdict(part) for part in (c.network, c.robot, c.camera)]
     del settings[1]["name"]  # its joints decide, and digests from before robots had names hold
-    found = hashlib.sha256(json.dumps(settings).encode())
+    digest = hashlib.sha256(json.dumps(settings).encode())
     arrays = pytree_digest.on_host(policy.train.params.actor["params"])
-    seen = policy.train.statistics.obs
-    for name, array in sorted({**arrays, "mean": seen.mean, "std": seen.std}.items()):
-        found.update(name.encode())
-        found.update(np.ascontiguousarray(array, np.float32).tobytes())
-    return found.hexdigest()
+    statistics = policy.train.statistics.obs
+    for name, array in sorted({**arrays, "mean": statistics.mean, "std": statistics.std}.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(array, np.float32).tobytes())
+    return digest.hexdigest()
 
 
 def read_contents(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return an exported policy's manifest and weights, every number checked."""
+    """Read an exported policy's manifest and weights, and check every number."""
     try:
         content, arrays = deploy.contents(path)
         deploy.Policy(content, arrays)
@@ -65,5 +65,5 @@ def read_contents(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def trained_config(content: dict[str, Any]) -> Config:
-    """Return the settings that an exported policy was trained with, from its manifest."""
+    """Read the settings that an exported policy was trained with from its manifest."""
     return config.override(Config(), content["provenance"]["config"])

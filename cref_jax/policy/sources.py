@@ -1,4 +1,4 @@
-"""Where a policy comes from: a run, what a run has learned, an export, or the bundled one."""
+"""Sources of a policy: a run, a learner file, an export, or the bundled policy."""
 
 import contextlib
 from pathlib import Path
@@ -10,11 +10,11 @@ from cref_jax.policy import learner_file, reader, trained
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import run_dir
 
-BUNDLED = "mixed"  # the policy that comes with the package
+BUNDLED = "mixed"  # the policy included in the package
 
 
 def resolve_policy(run: Path | None, policy: Path | None) -> Path:
-    """Return the run or the exported policy to look at: the newest run, or the bundled policy.
+    """Choose the run or the policy as given, else the newest run, else the bundled policy.
 
     Raises:
         ConfigError: both are given.
@@ -38,12 +38,12 @@ def find_policy(path: Path) -> Path:
 
 
 def is_run(path: Path) -> bool:
-    """Return whether this is a run and not an exported policy."""
+    """Check whether the path is a run and not an exported policy."""
     return path.suffix not in (".zip", ".npz") and not (path / "manifest.json").is_file()
 
 
 def read_config(path: Path) -> Config:
-    """Return the settings that a run, what it has learned, or an exported policy was trained with.
+    """Read the settings that a run, a learner file or an exported policy was trained with.
 
     Raises:
         ConfigError: it is none of these.
@@ -58,11 +58,11 @@ def read_config(path: Path) -> Config:
 
 
 def load(path: Path, world: World) -> TrainedPolicy:
-    """Return the policy of a run, of what it has learned, or an exported one, to evaluate in JAX.
+    """Load the policy of a run, a learner file or an export, for evaluation in JAX.
 
     Raises:
         ConfigError: it is none of these.
-        CheckpointError: the run has no checkpoint that can be read.
+        CheckpointError: the run has no readable checkpoint.
     """
     if learner_file.is_learner(path):
         return learner_file.read(path, world)

@@ -1,4 +1,4 @@
-"""A trained policy, and how it is loaded from a run."""
+"""A trained policy, and its loading from a run."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from cref_jax.training import iteration, run_dir
 
 
 class TrainedPolicy(NamedTuple):
-    """A trained policy and how it came about."""
+    """A trained policy and its origin."""
 
     config: Config
     train: ppo.TrainState
@@ -21,16 +21,16 @@ class TrainedPolicy(NamedTuple):
 
     @property
     def samples(self) -> int:
-        """Control steps of experience that it has learned from."""
+        """Control steps of training experience."""
         return self.iteration * self.config.run.num_envs * self.config.ppo.horizon
 
 
 def load_policy(run: Path, world: World) -> TrainedPolicy:
-    """Return the newest policy of a run; `world` may have another terrain than it was trained on.
+    """Load the newest policy of a run; `world` may have another terrain than in training.
 
     Raises:
-        ConfigError: there is no such run.
-        CheckpointError: it has no checkpoint that can be read.
+        ConfigError: the run does not exist.
+        CheckpointError: it has no readable checkpoint.
     """
     like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
     c = run_dir.read_config(run)
@@ -41,5 +41,5 @@ def load_policy(run: Path, world: World) -> TrainedPolicy:
 
 
 def with_averaged_actor(train: ppo.TrainState) -> ppo.TrainState:
-    """Return the state whose actor is the average: the policy that is evaluated and exported."""
+    """Replace the actor by its average: the policy that is evaluated and exported."""
     return train.replace(params=train.params._replace(actor=train.average))

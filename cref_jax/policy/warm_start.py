@@ -1,4 +1,4 @@
-"""A new training that begins as a trained policy."""
+"""Start of a new training from a trained policy."""
 
 import jax.numpy as jnp
 
@@ -6,13 +6,13 @@ from cref_jax import ppo
 from cref_jax.policy.trained import TrainedPolicy
 
 
-def begin_as(fresh: ppo.TrainState, policy: TrainedPolicy) -> ppo.TrainState:
-    """Return the state of a new training whose actor begins as this policy's."""
-    seen = policy.train.statistics.obs
+def start_from_policy(fresh: ppo.TrainState, policy: TrainedPolicy) -> ppo.TrainState:
+    """Start a new training from the policy's actor and observation statistics."""
+    trained = policy.train.statistics.obs
     statistics = fresh.statistics.obs.replace(
-        mean=seen.mean,
-        std=seen.std,
-        summed_variance=policy.samples * jnp.square(seen.std),
+        mean=trained.mean,
+        std=trained.std,
+        summed_variance=policy.samples * jnp.square(trained.std),
         count=fresh.statistics.obs.count + policy.samples,
     )
     return fresh.replace(

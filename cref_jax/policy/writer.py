@@ -1,7 +1,7 @@
-"""A trained policy as a directory that needs nothing of this package.
+"""A trained policy as a self-contained directory, independent of this package.
 
-manifest.json      everything but the weights, with units, frames and where it comes from
-weights.npz        float32 by flat names, stored
+manifest.json      everything but the weights, with units, frames and origin
+weights.npz        float32 by flat names, uncompressed
 testvectors.npz    reference inputs and outputs of the trained network
 cref_runtime.py    deploy.py, which runs the policy with numpy alone
 """
@@ -23,40 +23,40 @@ from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import pytree_digest
 
-ZIPPED = (1980, 1, 1, 0, 0, 0)  # date of every file: equal policies are equal bytes
+ZIPPED = (1980, 1, 1, 0, 0, 0)  # date of every file: equal policies give equal bytes
 
 
 def write(policy: TrainedPolicy, world: World, out: Path) -> None:
-    """Write the directory, and beside it the same as one .zip.
+    """Write the directory, and a .zip of the same files beside it.
 
     Raises:
-        ConfigError: the disk refused, or another file stands there.
+        ConfigError: a file cannot be written, or another file is in its place.
     """
     weights = pytree_digest.on_host(policy.train.params.actor["params"])
     files = {
-        "weights.npz": _npz({k: x.astype(np.float32) for k, x in weights.items()}),
-        "testvectors.npz": _npz(reference_vectors.test_vectors(world, policy.train)),
+        "weights.npz": _to_npz({k: x.astype(np.float32) for k, x in weights.items()}),
+        "testvectors.npz": _to_npz(reference_vectors.build_test_vectors(world, policy.train)),
         "cref_runtime.py": Path(deploy.__file__).read_bytes(),
     }
-    _write(out, build_manifest(policy, world.physics.robot), files)
+    _write_files(out, build_manifest(policy, world.physics.robot), files)
 
 
 def copy(policy: Path, out: Path) -> None:
     """Write an exported policy again with the runtime of this version; all else stays as it is.
 
     Raises:
-        ConfigError: it is no directory with a policy, or the disk refused.
+        ConfigError: it is not a policy directory, or a file cannot be written.
     """
     content, _ = reader.read_contents(policy)
     if not policy.is_dir():
         raise ConfigError(f"{policy} is not a directory")
     files = {name: (policy / name).read_bytes() for name in ("weights.npz", "testvectors.npz")}
     files["cref_runtime.py"] = Path(deploy.__file__).read_bytes()
-    _write(out, content, files)
+    _write_files(out, content, files)
 
 
-def _write(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:
-    """Write the files and a manifest with their digests, and beside them one .zip."""
+def _write_files(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:
+    """Write the files, a manifest with their digests, and one .zip beside them."""
     content["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     content["digest"] = deploy.manifest_digest(content)
     files["manifest.json"] = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
@@ -64,23 +64,23 @@ def _write(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
             (out / name).write_bytes(data)
-        out.with_name(out.name + ".zip").write_bytes(_stored(files))
+        out.with_name(out.name + ".zip").write_bytes(_zip_stored(files))
     except OSError as error:
         raise ConfigError(f"cannot write {out}: {error.strerror}") from None
 
 
-def _npz(arrays: dict[str, np.ndarray]) -> bytes:
-    """Return the arrays as an .npz without compression."""
+def _to_npz(arrays: dict[str, np.ndarray]) -> bytes:
+    """Encode the arrays as an uncompressed .npz."""
     files = {}
     for name, array in sorted(arrays.items()):
         data = io.BytesIO()
         np.lib.format.write_array(data, np.ascontiguousarray(array), version=(1, 0))
         files[f"{name}.npy"] = data.getvalue()
-    return _stored(files)
+    return _zip_stored(files)
 
 
-def _stored(files: dict[str, bytes]) -> bytes:
-    """Return an archive of the files, without compression."""
+def _zip_stored(files: dict[str, bytes]) -> bytes:
+    """Build an uncompressed archive of the files."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_STORED) as archive:
         for name, content in files.items():

@@ -1,7 +1,7 @@
 """Recurrent PPO, which knows nothing of robots."""
 
 from cref_jax.ppo.advantages import gae, prepare_batch, zero_invalid
-from cref_jax.ppo.learner import adapt, initial_state, minibatches, optimiser, update
+from cref_jax.ppo.learner import adapt_learning_rate, initial_state, minibatches, optimizer, update
 from cref_jax.ppo.normalization import (
     OBSERVATION_CLIP,
     STD_RANGE,
@@ -9,8 +9,8 @@ from cref_jax.ppo.normalization import (
     Count,
     RunningStatistics,
     initial_statistics,
-    normalise,
-    observe,
+    normalize,
+    update_statistics,
 )
 from cref_jax.ppo.records import (
     Actor,
@@ -41,15 +41,15 @@ __all__ = [
     "RunningStatistics",
     "Statistics",
     "TrainState",
-    "adapt",
+    "adapt_learning_rate",
     "gae",
     "initial_state",
     "initial_statistics",
     "minibatches",
-    "normalise",
-    "observe",
-    "optimiser",
+    "normalize",
+    "optimizer",
     "prepare_batch",
     "update",
+    "update_statistics",
     "zero_invalid",
 ]

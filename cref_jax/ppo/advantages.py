@@ -13,10 +13,10 @@ from cref_jax.ppo.reductions import mean_over_devices, mean_valid
 def prepare_batch(
     statistics: Statistics, rollout: Rollout, c: config.PPO, axis: str | None = None
 ) -> Batch:
-    """Return the rollout with advantages and returns, normalised.
+    """Normalise the observations of a rollout and compute advantages and returns.
 
-    An invalid step has the advantage 0 and passes none on: the steps before it are judged as if the
-    horizon had ended with them.
+    An invalid step has advantage 0 and propagates none: the steps before it are treated as if the
+    horizon had ended there.
     """
     clean = zero_invalid(rollout)
     advantage = gae(
@@ -32,8 +32,8 @@ def prepare_batch(
     centred = advantage - mean(advantage)
     deviation = jnp.sqrt(mean(jnp.square(centred)))
     return Batch(
-        obs=normalization.normalise(statistics.obs, clean.obs),
-        critic_obs=normalization.normalise(statistics.critic_obs, clean.critic_obs),
+        obs=normalization.normalize(statistics.obs, clean.obs),
+        critic_obs=normalization.normalize(statistics.critic_obs, clean.critic_obs),
         velocity=clean.velocity,
         action=clean.action,
         mean=clean.mean,
@@ -58,13 +58,13 @@ def gae(
     gamma: float,
     lam: float,
 ) -> Float[Array, "T E"]:
-    """Return the generalised advantage estimates (Schulman et al. 2016).
+    """Compute generalised advantage estimates (Schulman et al. 2016).
 
         d_t = r_t + gamma V(s'_t) [not terminated] - V(s_t)
         A_t = d_t + gamma lam A_{t+1} [neither terminated nor truncated]
 
-    s'_t is the state that step t led to, before any reset. So nothing comes after a fall, while an
-    episode that was only cut off is worth what the critic expects of its last state.
+    s'_t is the state after step t, before any reset. Nothing follows a fall, while an episode that
+    was truncated is bootstrapped with the critic's value of its last state.
     """
     delta = reward + gamma * jnp.where(terminated, 0.0, next_value) - value
     decay = jnp.where(terminated | truncated, 0.0, gamma * lam)
@@ -81,12 +81,12 @@ def gae(
 
 
 def zero_invalid(rollout: Rollout) -> Rollout:
-    """Return the rollout with zeros in place of the numbers of invalid samples."""
+    """Replace the values of invalid samples with zeros."""
 
     def keep(x: Shaped[Array, "T E *n"]) -> Shaped[Array, "T E *n"]:
         valid = rollout.valid.reshape(rollout.valid.shape + (1,) * (x.ndim - 2))
         return jnp.where(valid, x, jnp.zeros_like(x))
 
-    apart = {name: getattr(rollout, name) for name in ("carry", "sight", "twin")}
+    untouched = {name: getattr(rollout, name) for name in ("carry", "sight", "twin")}
     clean = jax.tree.map(keep, rollout._replace(carry=(), sight=(), twin=()))
-    return clean._replace(begins=rollout.begins, **apart)
+    return clean._replace(begins=rollout.begins, **untouched)

@@ -1,7 +1,7 @@
-"""What the actor's features hold of what only the critic is shown, read out by a linear map.
+"""Auxiliary loss: a linear readout of privileged critic observations from the actor's features.
 
-The paper has no such loss. Where samples are few, features that hold the ground around the robot
-are found sooner by it than by the rewards alone. The map itself is no part of the policy.
+The paper has no such loss. With few samples it teaches features that encode the ground around the
+robot sooner than the rewards alone do. The map itself is not part of the policy.
 """
 
 from typing import NamedTuple
@@ -18,13 +18,13 @@ class Readout(NamedTuple):
 
 
 def initial_readout(features: int, size: int) -> Readout:
-    """Return the map that has learned nothing."""
+    """Create the untrained map, all zeros."""
     return Readout(kernel=jnp.zeros((features, size)), bias=jnp.zeros(size))
 
 
-def error(
+def readout_error(
     readout: Readout, feature: Float[Array, "T E D"], critic_obs: Float[Array, "T E S"]
 ) -> Float[Array, "T E"]:
-    """Return the mean square by which it is wrong, in variances of what is read out."""
-    wanted = critic_obs[..., -readout.bias.size :]
-    return jnp.square(feature @ readout.kernel + readout.bias - wanted).mean(axis=-1)
+    """Compute the mean squared error of the readout, in units of each target's variance."""
+    target = critic_obs[..., -readout.bias.size :]
+    return jnp.square(feature @ readout.kernel + readout.bias - target).mean(axis=-1)

@@ -1,4 +1,4 @@
-"""The distribution that actions are drawn from: Gaussians, one a joint (the last axis)."""
+"""Diagonal Gaussian action distribution; the last axis is the joint."""
 
 import math
 
@@ -9,13 +9,13 @@ from jaxtyping import Array, Float
 def log_prob(
     x: Float[Array, "*n J"], mean: Float[Array, "*n J"], log_std: Float[Array, "*#n J"]
 ) -> Float[Array, "*n"]:
-    """Return log N(x; mean, std^2), summed over the independent coordinates."""
+    """Compute log N(x; mean, std^2), summed over the independent coordinates."""
     z = (x - mean) * jnp.exp(-log_std)
     return -jnp.sum(0.5 * jnp.square(z) + log_std + 0.5 * math.log(2.0 * math.pi), axis=-1)
 
 
 def entropy(log_std: Float[Array, " J"]) -> Float[Array, ""]:
-    """Return the entropy of a Gaussian, sum of log std + log(2 pi e) / 2, in nats."""
+    """Compute the entropy of a Gaussian, sum of log std + log(2 pi e) / 2, in nats."""
     return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
 
 
@@ -25,7 +25,7 @@ def kl(
     new_mean: Float[Array, "*n J"],
     new_log_std: Float[Array, " J"],
 ) -> Float[Array, "*n"]:
-    """Return KL(old || new) of two Gaussians, in nats.
+    """Compute KL(old || new) of two Gaussians, in nats.
 
     sum of log(s'/s) + (s^2 + (m - m')^2) / (2 s'^2) - 1/2
     """

@@ -1,8 +1,8 @@
 """Proximal policy optimisation for recurrent policies (Schulman et al. 2017).
 
-Knows nothing of robots. A rollout goes in as one record [T, E, ...], a train state comes out. Time
-is never split: a minibatch is some environments over the whole horizon, from their stored memory.
-Samples that are not `valid` count in no loss and in no statistic, whatever they hold.
+Independent of robots. The input is a rollout, one record [T, E, ...], the output a train state.
+Time is never split: a minibatch is a subset of environments over the whole horizon, started from
+their stored memory. Samples that are not `valid` enter no loss and no statistic.
 """
 
 import jax
@@ -16,28 +16,28 @@ from cref_jax.ppo.losses import loss
 from cref_jax.ppo.records import Batch, Losses, Networks, Params, Rollout, Statistics, TrainState
 from cref_jax.ppo.reductions import mean_over_devices
 
-_RATE_FACTOR = 1.5  # one adaptation of the learning rate; assumed: the usual factor
-_KL_BAND = 2.0  # the rate rests while the KL is within this factor of its target; assumed: usual
-_NEVER = 2**31 - 1  # bad gradients in a row before one is applied: when to stop is the caller's
+_RATE_FACTOR = 1.5  # per adaptation of the learning rate; assumed: the usual factor
+_KL_BAND = 2.0  # the rate is kept while the KL is within this factor of its target; assumed: usual
+_NEVER = 2**31 - 1  # bad gradients in a row before one is applied; the caller decides to stop
 
 
 def initial_state(params: Params, obs_size: int, critic_obs_size: int, c: config.PPO) -> TrainState:
-    """Return the state before the first iteration."""
+    """Create the state before the first iteration."""
     empty = normalization.initial_statistics
     return TrainState(
         params=params,
         average=params.actor,
-        opt_state=optimiser(c).init(params),
+        opt_state=optimizer(c).init(params),
         statistics=Statistics(obs=empty(obs_size), critic_obs=empty(critic_obs_size)),
         iteration=jnp.zeros((), jnp.int32),
     )
 
 
-def optimiser(c: config.PPO) -> optax.GradientTransformationExtraArgs:
-    """Return Adam on clipped gradients, its rate a part of its state.
+def optimizer(c: config.PPO) -> optax.GradientTransformationExtraArgs:
+    """Build Adam on clipped gradients, with the learning rate in its state.
 
-    A gradient that is not finite is skipped, however many come in a row, and counted in the state
-    as `notfinite_count` (in a row) and `total_notfinite`.
+    Non-finite gradients are always skipped, and counted in the state as `notfinite_count` (in a
+    row) and `total_notfinite`.
     """
     adam = optax.inject_hyperparams(optax.adam)(learning_rate=c.learning_rate)
     chain = optax.chain(optax.clip_by_global_norm(c.max_gradient_norm), adam)
@@ -54,28 +54,28 @@ def update(
 ) -> tuple[TrainState, Losses]:
     """Learn from one rollout; the losses are [epochs, minibatches].
 
-    The rollout is normalised by the statistics that it was made with. They learn of it at the end,
-    and so does the average: it fades over a tenth of all iterations, over `c.average` at most.
-    With an `axis` this is one of several devices, each with a rollout of its own: they agree on
-    every gradient, and learn as one device would from all the rollouts.
+    The rollout is normalised by the statistics it was collected with; they are updated at the end,
+    as is the average of the actor's parameters, whose time constant is a tenth of all iterations so
+    far, at most `c.average`. With an `axis`, this is one of several devices, each with its own
+    rollout: gradients are averaged, so they learn as one device would from all the rollouts.
     """
     batch = advantages.prepare_batch(state.statistics, rollout, c, axis)
     if networks.mirror is not None:
         mirrored = networks.mirror.obs(advantages.zero_invalid(rollout).obs)
-        batch = batch._replace(twin_obs=normalization.normalise(state.statistics.obs, mirrored))
+        batch = batch._replace(twin_obs=normalization.normalize(state.statistics.obs, mirrored))
 
     def on_batch(state: TrainState, batch: Batch) -> tuple[TrainState, Losses]:
         grads, losses = jax.grad(loss, has_aux=True)(state.params, batch, c, networks, axis)
         grads, losses = mean_over_devices((grads, losses), axis)
-        return _descend(state, grads, losses, c)
+        return _apply_gradients(state, grads, losses, c)
 
     def on_epoch(state: TrainState, key: PRNGKeyArray) -> tuple[TrainState, Losses]:
         return jax.lax.scan(on_batch, state, minibatches(batch, key, c.minibatches))
 
     state, losses = jax.lax.scan(on_epoch, state, jax.random.split(key, c.epochs))
     statistics = Statistics(
-        obs=normalization.observe(state.statistics.obs, rollout.obs, rollout.valid, axis),
-        critic_obs=normalization.observe(
+        obs=normalization.update_statistics(state.statistics.obs, rollout.obs, rollout.valid, axis),
+        critic_obs=normalization.update_statistics(
             state.statistics.critic_obs, rollout.critic_obs, rollout.valid, axis
         ),
     )
@@ -86,7 +86,7 @@ def update(
 
 
 def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:
-    """Return `count` random parts, each some environments over all time: [count, T, E', ...]."""
+    """Split a batch at random by environment into `count` minibatches [count, T, E', ...]."""
     num_envs = batch.value.shape[1]
     if num_envs % count:
         raise ValueError(f"{num_envs} environments do not split into {count} equal minibatches")
@@ -97,10 +97,12 @@ def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:
     return split._replace(carry=carry, twin=twin)
 
 
-def adapt(rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO) -> Float[Array, ""]:
-    """Return the learning rate, lower if the policy moved too far and higher if not far enough.
+def adapt_learning_rate(
+    rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO
+) -> Float[Array, ""]:
+    """Lower the learning rate if the policy moved too far; raise it if it moved too little.
 
-    A KL of 0 (nothing has moved yet) or NaN leaves it as it is.
+    A KL of 0 (no change yet) or NaN leaves it unchanged.
     """
     low, high = c.learning_rate_range
     slower = kl > _KL_BAND * c.target_kl
@@ -109,22 +111,23 @@ def adapt(rate: Float[Array, ""], kl: Float[Array, ""], c: config.PPO) -> Float[
     return jnp.clip(rate * factor, low, high)
 
 
-def _descend(
+def _apply_gradients(
     state: TrainState, grads: Params, losses: Losses, c: config.PPO
 ) -> tuple[TrainState, Losses]:
-    """Take one step of the optimiser at the rate that the KL asks for.
+    """Take one step of the optimiser at the rate adapted to the KL.
 
-    In the first `critic_first` iterations actor and rate stay; the actor begins at the lowest rate.
+    In the first `critic_first` iterations, actor and rate do not change; the actor then starts at
+    the lowest rate.
     """
     before = optax.tree.get(state.opt_state, "learning_rate")
-    rate = adapt(before, losses.kl, c)
+    rate = adapt_learning_rate(before, losses.kl, c)
     if c.critic_first:
         since = state.iteration - c.critic_first
         still = jax.tree.map(lambda g: jnp.where(since < 0, 0.0, g), grads.actor)
         rate = jnp.where(since > 0, rate, jnp.where(since < 0, before, c.learning_rate_range[0]))
         grads = grads._replace(actor=still)
     opt_state = optax.tree.set(state.opt_state, learning_rate=rate)
-    changes, opt_state = optimiser(c).update(grads, opt_state, state.params)
+    changes, opt_state = optimizer(c).update(grads, opt_state, state.params)
     state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)
     return state, losses._replace(
         gradient_norm=optax.tree.norm(grads),

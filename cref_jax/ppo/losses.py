@@ -1,6 +1,6 @@
-"""What PPO minimises, from records that know nothing of robots (Schulman et al. 2017).
+"""Losses of PPO, independent of robots (Schulman et al. 2017).
 
-Samples that are not `valid` count in no loss, whatever they hold.
+Samples that are not `valid` enter no loss.
 """
 
 import jax
@@ -15,7 +15,7 @@ from cref_jax.ppo.records import Actor, Batch, Losses, Mirror, Networks, Params
 def loss(
     params: Params, batch: Batch, c: config.PPO, networks: Networks, axis: str | None = None
 ) -> tuple[Float[Array, ""], Losses]:
-    """Return the weighted loss of a minibatch, and its parts; `axis` is as in `mean_valid`."""
+    """Compute the weighted loss of a minibatch and its parts; `axis` as in `mean_valid`."""
     mean = lambda x: reductions.mean_valid(x, batch.valid, axis)
     _, policy = networks.actor(params.actor, batch.carry, batch.obs, batch.begins, batch.sight)
     value = networks.critic(params.critic, batch.critic_obs)
@@ -26,12 +26,12 @@ def loss(
     error = jnp.sum(jnp.square(policy.velocity - batch.velocity), axis=-1)
     misread = jnp.zeros_like(value)
     if params.readout is not None:
-        misread = auxiliary.error(params.readout, policy.feature, batch.critic_obs)
+        misread = auxiliary.readout_error(params.readout, policy.feature, batch.critic_obs)
     askew = jnp.zeros_like(value)
     if networks.mirror is not None:
-        askew = asymmetry(params.actor, batch, policy.mean, networks.actor, networks.mirror)
+        askew = asymmetry_error(params.actor, batch, policy.mean, networks.actor, networks.mirror)
     parts = Losses(
-        surrogate=mean(surrogate(ratio, batch.advantage, c.clip)),
+        surrogate=mean(surrogate_loss(ratio, batch.advantage, c.clip)),
         value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),
         velocity=mean(error),
         readout=mean(misread),
@@ -51,22 +51,22 @@ def loss(
     return total, jax.lax.stop_gradient(parts)
 
 
-def asymmetry(
+def asymmetry_error(
     params: PyTree, batch: Batch, mean: Float[Array, "T E J"], actor: Actor, mirror: Mirror
 ) -> Float[Array, "T E"]:
-    """Return the mean over joints of (mu(o) - M mu(M o))^2, M the mirror (Yu et al. 2018, Eq. 4).
+    """Compute the mean over joints of (mu(o) - M mu(M o))^2, M the mirror (Yu et al. 2018, Eq. 4).
 
-    The actor in the mirror remembers what it has seen there: a memory cannot be mirrored.
+    The mirrored actor has its own memory of mirrored inputs: a memory cannot be mirrored.
     """
-    seen = mirror.sight(batch.sight)
-    _, twin = actor(params, batch.twin, batch.twin_obs, batch.begins, seen)
+    sight = mirror.sight(batch.sight)
+    _, twin = actor(params, batch.twin, batch.twin_obs, batch.begins, sight)
     return jnp.mean(jnp.square(mean - mirror.action(twin.mean)), axis=-1)
 
 
-def surrogate(
+def surrogate_loss(
     ratio: Float[Array, "T E"], advantage: Float[Array, "T E"], clip: float
 ) -> Float[Array, "T E"]:
-    """Return -min(r A, clip(r, 1 - clip, 1 + clip) A), the pessimistic policy loss."""
+    """Compute -min(r A, clip(r, 1 - clip, 1 + clip) A), the pessimistic policy loss."""
     return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)
 
 
@@ -76,6 +76,6 @@ def value_error(
     returns: Float[Array, "T E"],
     clip: float,
 ) -> Float[Array, "T E"]:
-    """Return the squared error of V, or of V held within `clip` of the old one if that is worse."""
-    held = old + jnp.clip(value - old, -clip, clip)
-    return jnp.maximum(jnp.square(value - returns), jnp.square(held - returns))
+    """Compute the squared error of V, or of V clipped to within `clip` of the old one if larger."""
+    clipped = old + jnp.clip(value - old, -clip, clip)
+    return jnp.maximum(jnp.square(value - returns), jnp.square(clipped - returns))

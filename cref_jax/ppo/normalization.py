@@ -1,4 +1,4 @@
-"""Running mean and deviation of the observations (Welford 1962, by batches)."""
+"""Running mean and standard deviation of the observations (Welford 1962, in batches)."""
 
 from typing import no_type_check
 
@@ -7,21 +7,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-OBSERVATION_CLIP = 10.0  # standard deviations; assumed: what lies beyond says nothing more
+OBSERVATION_CLIP = 10.0  # standard deviations; assumed: larger values carry no information
 VARIANCE_FLOOR = 1e-4  # added to each input's variance; assumed: a constant input stays near 0
 STD_RANGE = (1e-6, 1e6)  # assumed: outside, float32 divides badly
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map fill it with batches and with non-arrays
 @flax.struct.dataclass
 class Count:
-    """A number of samples of 64 bits, which JAX has none of by default."""
+    """A 64-bit sample count; JAX has no 64-bit integers by default."""
 
     hi: UInt32[Array, ""]
     lo: UInt32[Array, ""]
 
     def __add__(self, more: Int[Array, ""] | int) -> "Count":
-        """Add a number of samples that fits 32 bits."""
+        """Add a number of samples that fits in 32 bits."""
         lo = self.lo + jnp.uint32(more)
         return Count(self.hi + (lo < self.lo).astype(jnp.uint32), lo)
 
@@ -30,10 +30,10 @@ class Count:
         return jnp.float32(self.hi) * jnp.float32(2.0**32) + jnp.float32(self.lo)
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map fill it with batches and with non-arrays
 @flax.struct.dataclass
 class RunningStatistics:
-    """Mean and deviation of all valid samples so far."""
+    """Mean and standard deviation of all valid samples so far."""
 
     mean: Float[Array, " O"]
     std: Float[Array, " O"]
@@ -43,25 +43,25 @@ class RunningStatistics:
 
 
 def initial_statistics(size: int) -> RunningStatistics:
-    """Return the statistics of no samples: mean 0, deviation 1."""
+    """Create the statistics of no samples: mean 0, deviation 1."""
     zeros = jnp.zeros(size)
     none = jnp.zeros((), jnp.uint32)
     floor = jnp.full((), VARIANCE_FLOOR, jnp.float32)
     return RunningStatistics(zeros, jnp.ones(size), Count(none, none), zeros, floor)
 
 
-def normalise(statistics: RunningStatistics, x: Float[Array, "*n O"]) -> Float[Array, "*n O"]:
-    """Compute (x - mean) / std, within +-OBSERVATION_CLIP."""
+def normalize(statistics: RunningStatistics, x: Float[Array, "*n O"]) -> Float[Array, "*n O"]:
+    """Compute (x - mean) / std, clipped to +-OBSERVATION_CLIP."""
     return jnp.clip((x - statistics.mean) / statistics.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
-def observe(
+def update_statistics(
     statistics: RunningStatistics,
     x: Float[Array, "T E O"],
     valid: Bool[Array, "T E"],
     axis: str | None = None,
 ) -> RunningStatistics:
-    """Count the valid samples, of all devices, in.
+    """Update the statistics with the valid samples of all devices.
 
     mean' = mean + sum (x - mean) / n'
     S' = S + sum (x - mean) (x - mean'),  std' = sqrt(S' / n' + std_eps)

@@ -1,4 +1,4 @@
-"""The records of PPO: what is trained, what was experienced, what was lost."""
+"""Records of PPO: networks and parameters, rollouts and batches, losses."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, no_type_check
@@ -13,12 +13,12 @@ from cref_jax.ppo.normalization import RunningStatistics
 
 
 class Prediction(Protocol):
-    """What an actor says: a Gaussian over actions, and what it takes its velocity for."""
+    """Actor output: action distribution and estimated base velocity."""
 
     mean: Float[Array, "T E J"]
     log_std: Float[Array, " J"]
     velocity: Float[Array, "T E V"]
-    feature: Float[Array, "T E D"]  # that the mean is read off; only a readout looks at it
+    feature: Float[Array, "T E D"]  # input of the action head; used only by a readout
 
 
 # (params, carry, obs [T, E, O], begins [T, E], sight) -> (carry, prediction)
@@ -26,7 +26,7 @@ Actor = Callable[[PyTree, PyTree, Array, Array, PyTree], tuple[PyTree, Predictio
 
 
 class Mirror(NamedTuple):
-    """A symmetry of the world: what its mirror image senses, sees and does. Each undoes itself."""
+    """Reflections of observations, images and actions; each is its own inverse."""
 
     obs: Callable[[Array], Array]  # raw, [..., O]
     frames: Callable[[Array], Array]
@@ -35,16 +35,16 @@ class Mirror(NamedTuple):
 
 
 class Networks(NamedTuple):
-    """The two functions that are trained. They take normalised observations."""
+    """The two trained functions, of normalised observations."""
 
     actor: Actor
     # (params, critic_obs [T, E, S]) -> value [T, E]
     critic: Callable[[PyTree, Array], Array]
-    mirror: Mirror | None = None  # the symmetry that the actor is taught, if any
+    mirror: Mirror | None = None  # symmetry taught to the actor, if any
 
 
 class Params(NamedTuple):
-    """What the optimiser changes."""
+    """The parameters that the optimiser updates."""
 
     actor: PyTree
     critic: PyTree
@@ -52,7 +52,7 @@ class Params(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What the loss looks at: a rollout normalised, judged and free of invalid numbers."""
+    """Input of the loss: normalised rollout with advantages and returns; invalid samples zeroed."""
 
     obs: Float[Array, "T E O"]
     critic_obs: Float[Array, "T E S"]
@@ -68,19 +68,19 @@ class Batch(NamedTuple):
     carry: PyTree[Float[Array, "E ?H"]]
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None
     twin: PyTree[Float[Array, "E ?H"]] = None
-    twin_obs: Float[Array, "T E O"] | None = None  # what it senses
+    twin_obs: Float[Array, "T E O"] | None = None  # mirrored observations
 
 
 class Losses(NamedTuple):
-    """Unweighted parts of the loss of one minibatch, and how the step went."""
+    """Unweighted loss terms of one minibatch, and diagnostics of the step."""
 
     surrogate: Float[Array, "*n"]
     value: Float[Array, "*n"]
     velocity: Float[Array, "*n"]  # m^2/s^2
-    readout: Float[Array, "*n"]  # in variances of what is read out
+    readout: Float[Array, "*n"]  # in units of each target's variance
     asymmetry: Float[Array, "*n"]  # of the mean action, squared
     entropy: Float[Array, "*n"]  # nats
-    kl: Float[Array, "*n"]  # nats, of the behaviour policy from the present one
+    kl: Float[Array, "*n"]  # KL(behaviour policy || current policy), nats
     clipped: Float[Array, "*n"]  # share of samples whose ratio is outside the clip range
     gradient_norm: Float[Array, "*n"] | float = 0.0  # before clipping
     learning_rate: Float[Array, "*n"] | float = 0.0
@@ -88,22 +88,22 @@ class Losses(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """Running mean and deviation of what each network sees."""
+    """Running mean and deviation of each network's observations."""
 
     obs: RunningStatistics
     critic_obs: RunningStatistics
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map fill it with batches and with non-arrays
 @struct.dataclass
 class TrainState:
-    """Everything that learning carries from one iteration to the next."""
+    """The learner's state between iterations."""
 
     params: Params
-    average: PyTree  # of the actor's parameters, over the last iterations: steadier than they are
-    opt_state: optax.OptState  # holds the learning rate and the count of bad gradients, too
+    average: PyTree  # of the actor's parameters over recent iterations, to reduce noise
+    opt_state: optax.OptState  # includes the learning rate and the count of bad gradients
     statistics: Statistics
-    iteration: Int[Array | jax.ShapeDtypeStruct, "*seeds"]  # or its shape alone, in eval_shape
+    iteration: Int[Array | jax.ShapeDtypeStruct, "*seeds"]  # a ShapeDtypeStruct in eval_shape
 
 
 class Rollout(NamedTuple):
@@ -111,17 +111,17 @@ class Rollout(NamedTuple):
 
     obs: Float[Array, "T E O"]
     critic_obs: Float[Array, "T E S"]
-    velocity: Float[Array, "T E V"]  # what the estimator should have said
+    velocity: Float[Array, "T E V"]  # target of the estimator
     action: Float[Array, "T E J"]
-    mean: Float[Array, "T E J"]  # of the distribution that the action came from
-    log_std: Float[Array, "T E J"]  # of the distribution that the action came from
+    mean: Float[Array, "T E J"]  # of the action distribution
+    log_std: Float[Array, "T E J"]  # of the action distribution
     reward: Float[Array, "T E"]
-    value: Float[Array, "T E"]  # V of the state that the action was taken in
-    next_value: Float[Array, "T E"]  # V of the state that the step led to, before any reset
-    terminated: Bool[Array, "T E"]  # the episode ended in this step, and nothing follows
+    value: Float[Array, "T E"]  # V of the state before the action
+    next_value: Float[Array, "T E"]  # V of the state after the step, before any reset
+    terminated: Bool[Array, "T E"]  # the episode ended in this step; no value follows
     truncated: Bool[Array, "T E"]  # the episode was cut off after this step
-    begins: Bool[Array, "T E"]  # this step is the first of an episode: memory is empty before it
-    valid: Bool[Array, "T E"]  # False where the simulation failed; the next step must begin anew
+    begins: Bool[Array, "T E"]  # first step of an episode: memory is reset before it
+    valid: Bool[Array, "T E"]  # False where the simulation failed; the next step must have `begins`
     carry: PyTree[Float[Array, "E ?H"]]  # the actor's memory before the first step
-    sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # what the actor looks at besides, as it is
-    twin: PyTree[Float[Array, "E ?H"]] = None  # the memory of an actor that lives in the mirror
+    sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # further inputs of the actor, unnormalised
+    twin: PyTree[Float[Array, "E ?H"]] = None  # memory of the mirrored actor before the first step

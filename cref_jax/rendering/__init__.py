@@ -1,1 +1,1 @@
-"""Pictures and films of the robot on its terrain."""
+"""Images and videos of the robot on its terrain."""

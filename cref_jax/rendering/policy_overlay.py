@@ -1,4 +1,4 @@
-"""The picture of what the policy sees and does, beside that of the world."""
+"""A panel with the policy's depth image, attention and highway gate, beside the scene view."""
 
 from typing import NamedTuple
 
@@ -8,8 +8,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 WIDTH = 320  # pixels
-SECONDS = 4.0  # of the gate's history that are shown
-DEPTHS = "turbo_r"  # matplotlib's colours from near to far
+SECONDS = 4.0  # length of the gate history shown
+DEPTHS = "turbo_r"  # matplotlib colour map, near to far
 INK, PAPER, FAINT = (40, 40, 44), (250, 250, 248), (205, 205, 205)
 BAND, LINE = (190, 210, 235), (30, 90, 170)
 MARGIN = 12  # pixels
@@ -18,45 +18,45 @@ TITLE = 20  # pixels, height of a line of text
 Picture = UInt8[np.ndarray, "height width 3"]
 
 
-class Mind(NamedTuple):
-    """What is shown of the policy, up to one moment."""
+class PolicyView(NamedTuple):
+    """The policy's perception and gate up to one moment."""
 
-    depth: Float[np.ndarray, "H W"] | None  # D, normalised; None: nothing has been seen yet
+    depth: Float[np.ndarray, "H W"] | None  # D, normalised; None before the first frame
     attention: Float[np.ndarray, " N"] | None  # weights of the tokens, mean over the heads
     gates: Float[np.ndarray, "t D"]  # beta of each step so far
 
 
-def draw(mind: Mind, height: int, d_max: float, period: float, sees: bool) -> Picture:
-    """Return the panel; `period` lies between two rows of the gates, s.
+def draw(view: PolicyView, height: int, d_max: float, period: float, sees: bool) -> Picture:
+    """Draw the panel, `height` pixels high; `period` is the time between rows of the gates, s.
 
-    Without `sees` the policy is blind, and the gate is all there is to show.
+    For a blind policy (`sees` is False) only the gate is drawn.
     """
     picture = Image.new("RGB", (WIDTH, height), PAPER)
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
     inner, top = WIDTH - 2 * MARGIN, MARGIN
     if sees:
-        pen.text((MARGIN, top), f"depth, 0 to {d_max:g} m: near is red", INK, font)
+        pen.text((MARGIN, top), f"depth, 0 to {d_max:g} m (near is red)", INK, font)
         size = (inner, inner * 3 // 4)
-        picture.paste(_depth(mind.depth, size), (MARGIN, top + TITLE))
+        picture.paste(_depth_image(view.depth, size), (MARGIN, top + TITLE))
         top += TITLE + size[1] + MARGIN
-        pen.text((MARGIN, top), "attention, mean of the heads", INK, font)
+        pen.text((MARGIN, top), "attention, mean over heads", INK, font)
         size = (inner // 2, inner * 3 // 8)
-        picture.paste(_attention(mind.attention, size), (MARGIN, top + TITLE))
+        picture.paste(_attention_image(view.attention, size), (MARGIN, top + TITLE))
         top += TITLE + size[1] + MARGIN
-    pen.text((MARGIN, top), "highway gate: 1 leans on memory", INK, font)
-    _gate(pen, mind.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
+    pen.text((MARGIN, top), "highway gate (1: memory)", INK, font)
+    _draw_gate(pen, view.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
     return np.asarray(picture)
 
 
-def _depth(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
+def _depth_image(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
     if depth is None:
         return Image.new("RGB", size, FAINT)
     colours = matplotlib.colormaps[DEPTHS](np.clip(depth + 0.5, 0.0, 1.0), bytes=True)
     return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
 
 
-def _attention(weights: Float[np.ndarray, " N"] | None, size: tuple[int, int]) -> Image.Image:
-    """Return the tokens' weights where they lie in the image, brightest at the largest."""
+def _attention_image(weights: Float[np.ndarray, " N"] | None, size: tuple[int, int]) -> Image.Image:
+    """Draw the token weights at their image positions, scaled to the largest."""
     if weights is None:
         return Image.new("RGB", size, FAINT)
     rows = round((len(weights) * 3 / 4) ** 0.5)
@@ -65,13 +65,13 @@ def _attention(weights: Float[np.ndarray, " N"] | None, size: tuple[int, int]) -
     return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
 
 
-def _gate(
+def _draw_gate(
     pen: ImageDraw.ImageDraw,
     gates: Float[np.ndarray, "t D"],
     box: tuple[int, int, int, int],
     period: float,
 ) -> None:
-    """Draw the mean of the gate's channels and the band of the middle 80 % over time."""
+    """Draw the mean of the gate channels and the band from the 10th to the 90th percentile."""
     left, top, right, bottom = box
     shown = gates[-max(2, round(SECONDS / period)) :]
     span = max(1, round(SECONDS / period) - 1)

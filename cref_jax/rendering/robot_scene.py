@@ -1,8 +1,8 @@
-"""The picture of the world: the whole robot on its lane, as a MuJoCo model to draw.
+"""A MuJoCo model for rendering the whole robot on its lane.
 
-The lane is a slab on a plain. Columns of equal height are merged into boxes, in two tones so that
-motion shows: the tone changes with each tread and with each metre. Where too many boxes would be
-needed, as on a slope or on noise, a height field is drawn through the columns' middles instead.
+The lane is a slab on a plain. Columns of equal height are merged into boxes of two alternating
+tones, to make motion visible: the tone changes with each tread and each metre. Terrain that would
+need too many boxes, such as slopes and noise, becomes a height field through the column centres.
 """
 
 import mujoco
@@ -16,20 +16,20 @@ from cref_jax.rendering.video import Frame
 from cref_jax.robot.registry import describe
 from cref_jax.terrain import Terrain
 
-MOST_VERTICES = 1_000_000  # of a height field; more are drawn too slowly on a CPU
+MOST_VERTICES = 1_000_000  # of a height field; more render too slowly on a CPU
 BASE = 0.1  # m, from the plain to the lowest column
 PLAIN = (0.66, 0.72, 0.78)
 SKY = ((0.30, 0.50, 0.75), (0.88, 0.91, 0.94))  # at the zenith, at the horizon
 
-MARKS = ((0.95, 0.45, 0.10, 1.0), (0.10, 0.65, 0.30, 1.0))  # colours of the left and right foot's
+MARKS = ((0.95, 0.45, 0.10, 1.0), (0.10, 0.65, 0.30, 1.0))  # colours for the left and right foot
 MARK_RADIUS = 0.015  # m
 NO_MARKS = np.zeros((0, 0, 3))
 
-AZIMUTH = 100.0  # deg, where the camera looks: the robot walks to the right, and nearer a little
+AZIMUTH = 100.0  # deg, of the view: the robot walks to the right and slightly nearer
 ELEVATION = -14.0  # deg
 DISTANCE = 4.0  # m, from the camera to the pelvis
-VIEW = 32.0  # deg, vertical
-CALM = 1.0  # s of the pelvis's way that the camera averages over
+VIEW = 32.0  # deg, vertical field of view
+CALM = 1.0  # s, averaging window of the camera path
 
 
 def build(
@@ -38,21 +38,21 @@ def build(
     ground: Terrain,
     name: str = config.Robot.name,
 ) -> mujoco.MjModel:
-    """Return the model to draw; its qpos is that of the physics, its x and y those of `ground`."""
+    """Build the model to render; qpos is that of the physics, x and y are those of `ground`."""
     heights, origin = window(ground)
-    spec = stage(moves, physics, float(heights.min()) - BASE, name)
-    found = geoms.boxes(heights, max(1, round(TILE / ground.cell)))
-    if found is None:
-        _add_field(spec, heights, origin, ground.cell)
+    spec = build_stage(moves, physics, float(heights.min()) - BASE, name)
+    boxes = geoms.merge_boxes(heights, max(1, round(TILE / ground.cell)))
+    if boxes is None:
+        _add_height_field(spec, heights, origin, ground.cell)
     else:
-        _add_boxes(spec, found, origin, ground.cell)
+        _add_boxes(spec, boxes, origin, ground.cell)
     return spec.compile()
 
 
-def stage(
+def build_stage(
     moves: robot.Actuated, physics: config.Physics, z: float, name: str = config.Robot.name
 ) -> mujoco.MjSpec:
-    """Return the robot in its light, over an endless plain at height z, m."""
+    """Build the spec of the robot with lights, above an infinite plain at height z, m."""
     spec = robot.spec(moves, physics, contact_planes=0, visual=True, name=name)
     _add_light(spec, describe(name).base)
     _add_plain(spec, z)
@@ -60,12 +60,12 @@ def stage(
 
 
 def window(ground: Terrain) -> tuple[Float[np.ndarray, "X Y"], Float[np.ndarray, "2"]]:
-    """Return the heights of the columns in the terrain's window, and its outer corner, m."""
+    """Return the column heights of the terrain's window and the window's lower corner, m."""
     return ground.heights, np.asarray(ground.origin)
 
 
 class Canvas:
-    """A surface off the screen to draw one model on."""
+    """An offscreen renderer of one model."""
 
     def __init__(
         self,
@@ -75,10 +75,10 @@ class Canvas:
         azimuth: float = AZIMUTH,
         elevation: float = ELEVATION,
     ) -> None:
-        """Open the surface; the camera looks along azimuth and elevation, deg.
+        """Create the renderer; the camera looks along azimuth and elevation, deg.
 
         Raises:
-            ConfigError: this machine has no OpenGL.
+            ConfigError: OpenGL is not available.
         """
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._model, self._data = model, mujoco.MjData(model)
@@ -87,10 +87,10 @@ class Canvas:
         self._camera.distance = DISTANCE
         try:
             self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # each backend raises its own kinds
+        except Exception as error:  # the types depend on the backend
             raise ConfigError(
-                "cannot draw without OpenGL; on Debian and Ubuntu: "
-                "apt install libegl1 libosmesa6 libgl1; if a display is set but is not there: "
+                "rendering needs OpenGL; on Debian and Ubuntu: "
+                "apt install libegl1 libosmesa6 libgl1; if DISPLAY is set without a display: "
                 "MUJOCO_GL=egl"
             ) from error
 
@@ -106,9 +106,9 @@ class Canvas:
         look_at: Float[np.ndarray, "3"],
         marks: Float[np.ndarray, "F K 3"] = NO_MARKS,
     ) -> Frame:
-        """Return the picture of the robot in this pose, the camera turned to a point of space.
+        """Render the robot in this pose with the camera pointed at `look_at`, m.
 
-        `marks` are points to show, m, a colour for each foot; those that are NaN are left out.
+        `marks` are points to draw, m, in one colour per foot; NaN points are skipped.
         """
         self._data.qpos[:] = qpos
         mujoco.mj_forward(self._model, self._data)
@@ -116,42 +116,42 @@ class Canvas:
         self._renderer.update_scene(self._data, self._camera)
         for points, colour in zip(marks, MARKS, strict=False):
             for point in points[np.isfinite(points).all(axis=-1)]:
-                self._mark(point, colour)
+                self._add_mark(point, colour)
         return self._renderer.render()
 
-    def _mark(self, point: Float[np.ndarray, "3"], colour: tuple[float, ...]) -> None:
-        """Add a ball to the scene that is about to be drawn."""
-        drawn = self._renderer.scene
+    def _add_mark(self, point: Float[np.ndarray, "3"], colour: tuple[float, ...]) -> None:
+        """Add a sphere to the scene before it is rendered."""
+        scene = self._renderer.scene
         size, straight = np.full(3, MARK_RADIUS), np.eye(3).ravel()
         ball = mujoco.mjtGeom.mjGEOM_SPHERE
         mujoco.mjv_initGeom(
-            drawn.geoms[drawn.ngeom], ball, size, point, straight, np.array(colour, np.float32)
+            scene.geoms[scene.ngeom], ball, size, point, straight, np.array(colour, np.float32)
         )
-        drawn.ngeom += 1
+        scene.ngeom += 1
 
 
 def camera_path(qpos: Float[np.ndarray, "T Q"], period: float) -> Float[np.ndarray, "T 3"]:
-    """Return the points to look at, m: the pelvis's way, averaged over `CALM` around each pose.
+    """Compute the points to look at, m: the pelvis path averaged over `CALM` around each pose.
 
-    `period` lies between two poses, s. At both ends the way goes on as its mirror image through
-    the end point, so that a straight way stays as it is.
+    `period` is the time between poses, s. Both ends are extended by point reflection, so that a
+    straight path is unchanged.
     """
     path = qpos[:, :3]
     half = min(round(0.5 * CALM / period), len(path) - 1)
     weights = np.hanning(2 * half + 3)[1:-1]
     before = 2.0 * path[:1] - path[half:0:-1]
     after = 2.0 * path[-1:] - path[-2 : -2 - half : -1]
-    way = np.concatenate([before, path, after])
-    averaged = [np.convolve(axis, weights / weights.sum(), mode="valid") for axis in way.T]
+    extended = np.concatenate([before, path, after])
+    averaged = [np.convolve(axis, weights / weights.sum(), mode="valid") for axis in extended.T]
     return np.stack(averaged, axis=1)
 
 
 def _add_boxes(
-    spec: mujoco.MjSpec, found: Boxes, origin: Float[np.ndarray, "2"], cell: float
+    spec: mujoco.MjSpec, boxes: Boxes, origin: Float[np.ndarray, "2"], cell: float
 ) -> None:
-    """Add one geom a box, all standing on the plain."""
-    bottom = found.height.min() - BASE
-    for first, size, height, tone in zip(*found, strict=True):
+    """Add one geom per box, each resting on the plain."""
+    bottom = boxes.height.min() - BASE
+    for first, size, height, tone in zip(*boxes, strict=True):
         half = 0.5 * (height - bottom)
         spec.worldbody.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
@@ -164,13 +164,13 @@ def _add_boxes(
         )
 
 
-def _add_field(
+def _add_height_field(
     spec: mujoco.MjSpec,
     heights: Float[np.ndarray, "X Y"],
     origin: Float[np.ndarray, "2"],
     cell: float,
 ) -> None:
-    """Add a height field whose vertices are the columns' middles, thinned out on a huge map."""
+    """Add a height field through the column centres, subsampled on a huge map."""
     step = int(np.ceil(np.sqrt(heights.size / MOST_VERTICES)))
     heights = heights[::step, ::step]
     low, rise = float(heights.min()), float(np.ptp(heights))
@@ -195,11 +195,11 @@ def _add_field(
 
 
 def _add_plain(spec: mujoco.MjSpec, z: float) -> None:
-    """Add an endless plane under the lane, which the haze leads over into the sky."""
+    """Add an infinite plane under the lane that haze blends into the sky."""
     spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE,
         pos=[0.0, 0.0, z],
-        size=[0.0, 0.0, 1.0],  # without bounds
+        size=[0.0, 0.0, 1.0],  # unbounded
         rgba=[*PLAIN, 1.0],
         contype=0,
         conaffinity=0,
@@ -208,7 +208,7 @@ def _add_plain(spec: mujoco.MjSpec, z: float) -> None:
 
 
 def _add_light(spec: mujoco.MjSpec, base: str) -> None:
-    """Add the sky, soft light from everywhere, and a sun above the robot that casts shadows."""
+    """Add the sky, ambient light and a shadow-casting sun that follows the robot."""
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -234,7 +234,7 @@ def _add_light(spec: mujoco.MjSpec, base: str) -> None:
     visual.rgba.haze = [*SKY[1], 1.0]
     visual.global_.fovy = VIEW
     visual.quality.shadowsize = 2048
-    visual.map.shadowclip = 1.5  # of the extent: half the side of the square with shadows
+    visual.map.shadowclip = 1.5  # of the extent: half the side of the shadowed square
     visual.map.haze = 0.6
     visual.map.zfar = 50.0  # of the extent
     spec.stat.extent = 2.0  # m

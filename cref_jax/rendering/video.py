@@ -1,4 +1,4 @@
-"""Pictures to files."""
+"""Writing of images and videos."""
 
 import cref_jax.system.startup  # noqa: F401
 
@@ -19,7 +19,11 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 
 def write_stills(out: Path, frames: Iterable[Frame]) -> None:
-    """Write pictures side by side as one."""
+    """Write frames side by side as one image.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
     try:
         Image.fromarray(np.concatenate(list(frames), axis=1)).save(out)
     except OSError as error:
@@ -27,8 +31,12 @@ def write_stills(out: Path, frames: Iterable[Frame]) -> None:
 
 
 def write_video(out: Path, frames: Iterable[Frame], rate: float) -> None:
-    """Write pictures as a film of `rate` pictures a second."""
-    part = out.with_suffix(".part.mp4")  # a film that was cut off does not replace a whole one
+    """Write frames as an H.264 video of `rate` frames per second.
+
+    Raises:
+        ConfigError: ffmpeg fails.
+    """
+    part = out.with_suffix(".part.mp4")  # an interrupted video does not replace a complete one
     frames = iter(frames)
     first = next(frames)
     size = f"{first.shape[1]}x{first.shape[0]}"
@@ -39,12 +47,13 @@ def write_video(out: Path, frames: Iterable[Frame], rate: float) -> None:
     try:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
             assert ffmpeg.stdin and ffmpeg.stderr
-            with contextlib.suppress(BrokenPipeError):  # it says why, and exits
+            with contextlib.suppress(BrokenPipeError):  # ffmpeg reports the reason and exits
                 for frame in itertools.chain([first], frames):
                     ffmpeg.stdin.write(frame.tobytes())
-            said = ffmpeg.communicate()[1].decode(errors="replace").strip()
+            message = ffmpeg.communicate()[1].decode(errors="replace").strip()
         if ffmpeg.returncode:
-            raise ConfigError(f"cannot write {out}: {said.splitlines()[-1] if said else 'ffmpeg'}")
+            reason = message.splitlines()[-1] if message else "ffmpeg"
+            raise ConfigError(f"cannot write {out}: {reason}")
         part.replace(out)
     finally:
         part.unlink(missing_ok=True)

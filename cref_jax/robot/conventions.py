@@ -19,7 +19,7 @@ def check_conventions(spec: mujoco.MjSpec, robot: Description) -> None:
 
 
 def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
-    """Yield what is wrong with joints, motors, bodies, geoms and sites, in this order."""
+    """Yield complaints about joints, motors, bodies, geoms and sites, in this order."""
     free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
     joints = list(spec.joints)
     if not joints or joints[0].type != free or joints[0].parent.name != robot.base:

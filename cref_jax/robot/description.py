@@ -1,4 +1,4 @@
-"""What the program must be told about a robot besides its MJCF: names, pose and roles.
+"""A robot as data beside its MJCF: names, pose and roles.
 
 Conventions of the MJCF, checked by `model.spec` and named in one line where they are not kept:
 
@@ -59,9 +59,9 @@ class Description:
         return -angle if mirrored and angle else angle
 
     def is_leg(self, joint: str) -> bool:
-        """Return whether a joint is one of the legs'."""
+        """Return whether a joint belongs to a leg."""
         return joint.partition("_")[2].startswith(self.legs)
 
     def is_waist(self, joint: str) -> bool:
-        """Return whether a joint is one of the waist's."""
+        """Return whether a joint belongs to the waist."""
         return joint.startswith(self.waist)

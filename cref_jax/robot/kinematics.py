@@ -1,4 +1,4 @@
-"""Where the links of one robot are and how they move: forward kinematics in plain JAX.
+"""Forward kinematics of one robot in plain JAX.
 
 Both engines hand over only the state; what the reward, the camera and the ground contacts want to
 know of the links is worked out here, so it cannot differ between them.
@@ -17,7 +17,7 @@ from cref_jax import geometry
 
 
 class Level(NamedTuple):
-    """Links of equal depth, one hinge each, computed together: N = 2 while there are only legs."""
+    """Links of equal depth, one hinge each, computed together; N = 2 for legs alone."""
 
     body: Int[np.ndarray, " N"]  # body id
     parent: Int[np.ndarray, " N"]  # row in the level above
@@ -45,7 +45,7 @@ class Links(NamedTuple):
 
 
 def tree(model: mujoco.MjModel) -> Tree:
-    """Return the tree of a model of `robot.spec`: a free pelvis, then one hinge a link."""
+    """Read the tree of a model of `robot.spec`: a free base, then one hinge per link."""
     bodies = [b for b in range(1, model.nbody) if model.body_rootid[b] == 1]
     if bodies != list(range(1, len(bodies) + 1)) or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
         raise ValueError("the robot must come first in the model, with a free pelvis")
@@ -70,7 +70,7 @@ def tree(model: mujoco.MjModel) -> Tree:
 
 
 def links(tree: Tree, qpos: Float[Array, " Q"], qvel: Float[Array, " V"]) -> Links:
-    """Return pose and velocity of every link of one robot.
+    """Compute pose and velocity of every link.
 
     qpos is the pelvis's position and quaternion, then the joints; qvel is the pelvis's linear
     velocity in the world frame, its angular velocity in its own (MuJoCo's free joint), then the
@@ -92,14 +92,14 @@ def links(tree: Tree, qpos: Float[Array, " Q"], qvel: Float[Array, " V"]) -> Lin
 def points(
     links: Links, body: Int[np.ndarray, " P"], offset: Float[np.ndarray, "P 3"]
 ) -> Float[Array, "P 3"]:
-    """Return the world positions of points fixed to links at `offset`, m in the link's frame."""
+    """Compute the world positions of points fixed to links at `offset`, m in the link's frame."""
     return links.position[body] + geometry.rotate(links.rotation[body], jnp.asarray(offset))
 
 
 def _descend(
     level: Level, above: Links, angle: Float[Array, " N"], speed: Float[Array, " N"]
 ) -> Links:
-    """Return the links of one level from those of the level above."""
+    """Compute the links of one level from those of the level above."""
     parent = Links(*(x[level.parent] for x in above))
     step = geometry.rotate(parent.rotation, jnp.asarray(level.offset))
     axis = jnp.asarray(level.axis)

@@ -22,7 +22,7 @@ FRICTION = 0.9  # of a contact sphere on the ground; assumed: rubber on a dry fl
 
 
 class Spheres(NamedTuple):
-    """Where the robot touches the world: S spheres under feet and on shanks."""
+    """Contact spheres, S under feet and on shanks."""
 
     names: tuple[str, ...]
     body: Int[np.ndarray, " S"]  # body id in the model of `spec`
@@ -32,7 +32,7 @@ class Spheres(NamedTuple):
 
 
 class Capsules(NamedTuple):
-    """The shape of the links, for the depth image and for noticing a fall."""
+    """Shapes of the links, for the depth image and for detecting a fall."""
 
     names: tuple[str, ...]
     body: Int[np.ndarray, " C"]  # body id in the model of `spec`
@@ -44,7 +44,7 @@ class Capsules(NamedTuple):
 
 
 class Mount(NamedTuple):
-    """Where something is fixed to the robot; x points forward, z up in the nominal pose."""
+    """Pose of something fixed to the robot; x forward, z up in the nominal pose."""
 
     body: int  # body id in the model of `spec`
     position: Float[np.ndarray, "3"]  # m, body frame
@@ -80,9 +80,14 @@ class Robot:
     camera: Mount
     imu: Mount
 
+    @property
+    def num_joints(self) -> int:
+        """J, the number of actuated joints."""
+        return len(self.joint_names)
+
 
 def load(c: config.Robot) -> Robot:
-    """Return the robot with the joints of `c.actuated`, read off the model that moves."""
+    """Read the robot with the joints of `c.actuated` from its compiled model."""
     data = describe(c.name)
     model = spec(moving(c), config.Physics(), 0, visual=True, name=c.name).compile()
     joints = [model.joint(j).name for j in range(1, model.njnt)]  # joint 0 is the base's
@@ -118,7 +123,7 @@ def load(c: config.Robot) -> Robot:
 
 
 def moving(c: config.Robot) -> Actuated:
-    """Return which joints move: those that the policy drives, and those that are held."""
+    """Return which joints move: driven by the policy, or held."""
     return max(c.actuated, MOVING[c.held], key=get_args(Actuated).index)
 
 
@@ -178,7 +183,7 @@ def add_force_sensors(spec: mujoco.MjSpec, name: str = config.Robot.name) -> Non
 
 
 def solve_sparsely(spec: mujoco.MjSpec) -> None:
-    """Let MuJoCo C skip the zeros of the Hessian: the legs do not act on each other's joints.
+    """Let MuJoCo C skip the Hessian's zeros: the legs do not act on each other's joints.
 
     A step of a robot takes a fifth less time. A robot alone is one island, and not worth a search.
     """

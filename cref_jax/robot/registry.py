@@ -1,6 +1,6 @@
-"""The robots that there are: one line per robot."""
+"""All robots, one line each."""
 
-from cref_jax.config import unknown
+from cref_jax.config import describe_unknown
 from cref_jax.errors import ConfigError
 from cref_jax.robot.description import Description
 from cref_jax.robot.x2_ultra import X2_ULTRA
@@ -17,5 +17,5 @@ def describe(name: str) -> Description:
         ConfigError: there is no such robot.
     """
     if name not in ROBOTS:
-        raise ConfigError(unknown("robot", name, list(ROBOTS)))
+        raise ConfigError(describe_unknown("robot", name, list(ROBOTS)))
     return ROBOTS[name]

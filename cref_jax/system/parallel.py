@@ -1,7 +1,8 @@
-"""The same work many times over, in a process a core.
+"""Parallel jobs, one worker process per core.
 
-For work that is half numpy's many small calls, which threads of one interpreter take turns at. Each
-process is a fresh interpreter, since JAX does not survive a fork, and makes its worker once.
+For work dominated by many small numpy calls, which the threads of one interpreter cannot run in
+parallel. Each process is a fresh interpreter, since JAX does not survive a fork, and builds its
+worker once.
 """
 
 import concurrent.futures
@@ -20,7 +21,7 @@ R = TypeVar("R")
 
 
 def cores() -> int:
-    """Return the cores that this process may use; macOS does not limit them."""
+    """Count the cores available to this process; macOS does not limit them."""
     limited = hasattr(os, "sched_getaffinity")
     return len(os.sched_getaffinity(0)) if limited else os.cpu_count() or 1
 
@@ -31,26 +32,26 @@ def run(
     jobs: Sequence[J],
     count: int | None = None,
 ) -> list[R]:
-    """Return what a worker, `make(*arguments)`, says to each job, with a progress bar.
+    """Apply a worker, `make(*arguments)`, to each job, with a progress bar.
 
     Args:
-        make: a class or function of a module, so that another process finds it.
-        arguments: can be pickled, as jobs and results can.
-        jobs: in the order of the results.
-        count: of processes; one a core when left out; with 1 all is done in this one.
+        make: a module-level class or function, so that another process can import it.
+        arguments: picklable, as jobs and results must be.
+        jobs: the inputs; results come in the same order.
+        count: number of processes, by default one per core; 1 runs all jobs in this process.
     """
     count = min(count or cores(), len(jobs))
-    shown = lambda results: list(track(results, "walking", len(jobs), transient=True))
+    collect = lambda results: list(track(results, "walking", len(jobs), transient=True))
     if count == 1:
-        return shown(map(make(*arguments), jobs))
+        return collect(map(make(*arguments), jobs))
     pool = concurrent.futures.ProcessPoolExecutor(
-        count, multiprocessing.get_context("spawn"), _begin, (make, arguments)
+        count, multiprocessing.get_context("spawn"), _start_worker, (make, arguments)
     )
     try:
         with _without_interrupts():
-            futures = [pool.submit(_work, job) for job in jobs]
-        return shown(future.result() for future in futures)
-    except BaseException:  # such as Ctrl-C, which does not wait for the others
+            futures = [pool.submit(_run_job, job) for job in jobs]
+        return collect(future.result() for future in futures)
+    except BaseException:  # such as Ctrl-C: do not wait for the other jobs
         for child in multiprocessing.active_children():
             child.kill()
         raise
@@ -58,17 +59,17 @@ def run(
         pool.shutdown()
 
 
-_worker: Callable[[Any], Any] | None = None  # of this process
+_worker: Callable[[Any], Any] | None = None  # one per process
 
 
-def _begin(make: Callable[..., Callable[[Any], Any]], arguments: tuple[Any, ...]) -> None:
+def _start_worker(make: Callable[..., Callable[[Any], Any]], arguments: tuple[Any, ...]) -> None:
     global _worker
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker = make(*arguments)
 
 
 def _end_with_parent() -> None:
-    """Wait for the end of the process that made this one: after Ctrl-C nobody else tells it."""
+    """Exit when the parent process ends: after Ctrl-C nothing else stops a worker."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -77,7 +78,7 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C from the processes that are made here: each would print a traceback."""
+    """Block Ctrl-C in processes started here: each would print a traceback."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -85,6 +86,6 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(job: Any) -> Any:
+def _run_job(job: Any) -> Any:
     assert _worker is not None
     return _worker(job)

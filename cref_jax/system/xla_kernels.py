@@ -1,9 +1,9 @@
-"""Where XLA for a CPU ends one kernel and begins the next.
+"""Boundaries between XLA kernels.
 
-It would rather compute a value again in each kernel that reads it, and again for each element where
-a kernel reads it more than once: an index into the ground for each of seventeen columns, a search
-for each of three coordinates. A loop of simple steps over arrays in memory is also one that the
-CPU's vector units can run, and a fused one often is not.
+On a CPU, XLA recomputes a value in each kernel that reads it, and for each element if a kernel
+reads it more than once: a terrain index for each of seventeen columns, a search for each of three
+coordinates. A loop of simple steps over arrays in memory can also be vectorised, and a fused one
+often cannot.
 """
 
 import functools
@@ -19,24 +19,24 @@ R = TypeVar("R")
 
 
 def as_own_kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function as one whose arguments and results are in memory, on a CPU.
+    """Wrap a function so that, on a CPU, its arguments and results are arrays in memory.
 
-    It computes the same. An accelerator has its own way to divide a program into kernels.
+    The result is the same. Accelerators keep their own division of a program into kernels.
     """
 
     @functools.wraps(function)
-    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if jax.default_backend() != "cpu":
             return function(*args, **kwargs)
         return xla_metadata_call(inlineable="false")(function)(*args, **kwargs)
 
-    return called
+    return call
 
 
 def materialize(values: PyTree) -> PyTree:
-    """Return values that an accelerator has in memory before anything reads them.
+    """Make an accelerator store values in memory before anything reads them.
 
-    XLA for a GPU would compute them within the kernel that reads them, and where that one turns
-    them over, as patches of an image, element by element: on an H100 in 7 ms instead of one.
+    XLA for a GPU would otherwise compute them in the kernel that reads them, element by element if
+    that kernel transposes them, as into image patches: on an H100 in 7 ms instead of 1 ms.
     """
     return jax.lax.optimization_barrier(values)

@@ -1,4 +1,4 @@
-"""All lanes in one grid, and which of them a robot walks on."""
+"""All lanes in one grid, and the assignment of robots to lanes."""
 
 from typing import no_type_check
 
@@ -12,22 +12,22 @@ from cref_jax.errors import ConfigError
 from cref_jax.terrain import column_grid
 from cref_jax.terrain.column_grid import Grid, Terrain
 
-MAX_COLUMNS = 2e8  # of a grid; 0.8 GB; assumed
+MAX_COLUMNS = 2e8  # per grid; 0.8 GB; assumed
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map put batches and non-arrays in it
 @flax.struct.dataclass
 class Atlas:
     """All lanes in one grid: rows are the variants of each level, columns are kinds."""
 
     terrain: Grid
-    places: Float[np.ndarray | Array, "rows kinds places 2"]  # m, x and height of level stretches
-    # before the last obstacle of each lane; NaN where there are none
+    places: Float[np.ndarray | Array, "rows kinds places 2"]
+    """m, x and height of level stretches before each lane's last obstacle; NaN if it has none."""
     sizes: Float[np.ndarray | Array, "levels kinds"]  # m; m/m for a slope
     kinds: tuple[str, ...] = flax.struct.field(pytree_node=False)
-    is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # each kind: level across
-    turns: tuple[int, ...] = flax.struct.field(pytree_node=False)  # kinds that robots get in turn
-    variants: int = flax.struct.field(pytree_node=False, default=1)  # of each level of each kind
+    is_profile: tuple[bool, ...] = flax.struct.field(pytree_node=False)  # per kind: level across
+    turns: tuple[int, ...] = flax.struct.field(pytree_node=False)  # kinds, assigned round-robin
+    variants: int = flax.struct.field(pytree_node=False, default=1)  # per level and kind
 
     @property
     def levels(self) -> int:
@@ -41,33 +41,37 @@ class Atlas:
 
     @property
     def end(self) -> Float[ArrayLike, ""]:
-        """Where a lane ends, m along it."""
+        """End of a lane, x in m."""
         return self.terrain.origin[0] + self.length
 
     def kind_of(self, robot: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-        """Return the kind of lane that the robots of these numbers are on."""
+        """Return the kind of lane of each robot index."""
         return np.asarray(self.turns)[robot % len(self.turns)]
 
     def tile(
         self, level: Int[ArrayLike, ""], kind: Int[ArrayLike, ""], variant: Int[ArrayLike, ""] = 0
     ) -> Terrain:
-        """Return one lane: x from 0 at its start, y from 0 in its middle, z = 0 at the start."""
+        """Return one lane: x = 0 and z = 0 at its start, y = 0 in its middle."""
         return column_grid.tile(self.terrain, level * self.variants + variant, kind)
 
-    def level_place(
+    def sample_level_place(
         self,
         kind: Int[Array, ""],
         level: Int[Array, ""],
         variant: Int[Array, ""],
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Draw where a robot may start on a lane, x and height, m; NaN where at its start alone."""
+        """Sample a start on a level stretch of a lane: x and height, m; NaN if it has none."""
         of_lane = jnp.asarray(self.places)[level * self.variants + variant, kind]
         x, z = of_lane[jax.random.randint(key, (), 0, of_lane.shape[0])]
         return x, z
 
 
-def check_columns(shape: tuple[int, int], what: str) -> None:
-    """Refuse a grid that would not fit into memory."""
+def check_columns(shape: tuple[int, int], name: str) -> None:
+    """Check that a grid of this shape fits into memory.
+
+    Raises:
+        ConfigError: it has more than MAX_COLUMNS columns.
+    """
     if shape[0] * shape[1] > MAX_COLUMNS:
-        raise ConfigError(f"{what} has {shape[0]} x {shape[1]} columns, more than {MAX_COLUMNS:g}")
+        raise ConfigError(f"{name} has {shape[0]} x {shape[1]} columns, more than {MAX_COLUMNS:g}")

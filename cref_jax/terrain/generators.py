@@ -1,8 +1,8 @@
-"""What lies in a lane: level ground, and on it noise, ramps, steps, trenches or boxes.
+"""Lane generators: level ground with noise, ramps, steps, trenches or boxes.
 
-Each function draws one kind of lane, as wide and as long as `config.Terrain` says, from physical
-sizes in metres, never from a difficulty. A lane begins with level ground at z = 0, ends with level
-ground, leads along +x, and what stands or lies in it spans its whole width.
+Each function generates one kind of lane, of the width and length in `config.Terrain`, from physical
+sizes in metres, never from a difficulty. A lane runs along +x, begins with level ground at z = 0,
+ends with level ground, and its obstacles span its whole width.
 """
 
 from collections.abc import Callable
@@ -15,30 +15,30 @@ from jaxtyping import Float
 from cref_jax import config
 from cref_jax.errors import ConfigError
 
-START = 1.5  # m, level ground at the start; assumed: the robot is put down at 0.5 to 1 m
-END = 1.0  # m, level ground at the end, at least; assumed
-PLACES = 32  # of a lane, that robots may start from; assumed
-LEVEL = 0.45  # m, level ground before and behind such a place; wider than any trench, so not in one
+START = 1.5  # m, level ground at the start; assumed: the robot starts at 0.5 to 1 m
+END = 1.0  # m, minimum level ground at the end; assumed
+PLACES = 32  # start places per lane; assumed
+LEVEL = 0.45  # m, level on both sides of a start place; wider than any trench, so never in one
 
 Heights = Float[np.ndarray, "X Y"]  # m
-Range = tuple[float, float]  # from, to; uniform
+Range = tuple[float, float]  # low, high; uniform
 
 
 @dataclass(frozen=True)
 class Flat:
-    """Level ground has no numbers."""
+    """Level ground, without parameters."""
 
 
 @dataclass(frozen=True)
 class Rough:
-    """Numbers of uneven ground."""
+    """Parameters of uneven ground."""
 
     spacing: float  # m, between independent heights
 
 
 @dataclass(frozen=True)
 class Slope:
-    """Numbers of a ramp up, a level stretch and a ramp down."""
+    """Parameters of a ramp up, a level stretch and a ramp down."""
 
     run: Range  # m, horizontal length of a ramp
     level: Range  # m
@@ -46,41 +46,46 @@ class Slope:
 
 @dataclass(frozen=True)
 class Stairs:
-    """Numbers of two flights with a landing between them."""
+    """Parameters of two flights with a landing between them."""
 
-    tread: tuple[float, ...]  # m, one of these for the whole lane
-    steps: tuple[int, int]  # of a flight, from, to; fewer where the lane is too short
+    tread: tuple[float, ...]  # m, one is sampled per lane
+    steps: tuple[int, int]  # per flight, fewest, most; fewer if the lane is too short
     landing: float  # m
 
 
 @dataclass(frozen=True)
 class Flight:
-    """Numbers of one flight."""
+    """Parameters of one flight."""
 
     tread: float  # m
-    steps: tuple[int, int]  # from, to
+    steps: tuple[int, int]  # fewest, most
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Numbers of the trenches in a lane."""
+    """Parameters of the trenches in a lane."""
 
-    count: int  # at most: as many as the lane has room for
+    count: int  # at most; limited by the lane's length
     depth: float  # m
-    landing: Range  # m, before each trench; START at least before the first
+    landing: Range  # m, before each trench; at least START before the first
 
 
 @dataclass(frozen=True)
 class Platform:
-    """Numbers of the boxes in a lane."""
+    """Parameters of the boxes in a lane."""
 
-    count: tuple[int, int]  # from, to: as many as the lane has room for
-    length: Range  # m, of a box
-    landing: Range  # m, before each box; START at least before the first
+    count: tuple[int, int]  # fewest, most; limited by the lane's length
+    length: Range  # m, per box
+    landing: Range  # m, before each box; at least START before the first
 
 
-def level_places(profile: Float[np.ndarray, " X"], cell: float) -> Float[np.ndarray, "places 2"]:
-    """Return x and height of PLACES level stretches of a lane with this profile, in even spread."""
+def find_level_places(
+    profile: Float[np.ndarray, " X"], cell: float
+) -> Float[np.ndarray, "places 2"]:
+    """Find x and height, m, of PLACES evenly spread level stretches before the last obstacle.
+
+    All NaN if the profile has no obstacle or no such stretch.
+    """
     reach = round(LEVEL / cell)
     stretch = np.lib.stride_tricks.sliding_window_view(profile, 2 * reach + 1)
     is_level = np.ptp(stretch, axis=1) == 0.0
@@ -94,14 +99,14 @@ def level_places(profile: Float[np.ndarray, " X"], cell: float) -> Float[np.ndar
 
 
 def flat(c: config.Terrain, size: float, shape: Flat, rng: np.random.Generator) -> Heights:
-    """Return level ground; it has no size."""
-    return _across(c, [(c.lane_length, 0.0)])
+    """Generate level ground; `size` is unused."""
+    return _extrude(c, [(c.lane_length, 0.0)])
 
 
 def rough(c: config.Terrain, size: float, shape: Rough, rng: np.random.Generator) -> Heights:
-    """Return uneven ground, `size` metres from its lowest to its highest column."""
+    """Generate uneven ground, `size` metres from its lowest to its highest column."""
     _check_length(c, START + END + 1.0)
-    x, y = _centres(c)
+    x, y = _column_centres(c)
     coarse_x = np.arange(0.0, c.lane_length + shape.spacing, shape.spacing)
     coarse_y = np.arange(0.0, c.lane_width + shape.spacing, shape.spacing)
     hat = lambda fine, coarse: np.maximum(1.0 - abs(fine[:, None] - coarse) / shape.spacing, 0.0)
@@ -113,16 +118,16 @@ def rough(c: config.Terrain, size: float, shape: Rough, rng: np.random.Generator
 
 
 def slope(c: config.Terrain, size: float, shape: Slope, rng: np.random.Generator) -> Heights:
-    """Return a ramp up of gradient `size`, a level stretch and a ramp down to z = 0."""
+    """Generate a ramp up of gradient `size`, a level stretch and a ramp down to z = 0."""
     run, level = rng.uniform(*shape.run), rng.uniform(*shape.level)
     knots = START + np.cumsum([0.0, run, level, run])
     _check_length(c, knots[-1] + END)
-    profile = np.interp(_centres(c)[0], knots, [0.0, run * size, run * size, 0.0])
+    profile = np.interp(_column_centres(c)[0], knots, [0.0, run * size, run * size, 0.0])
     return np.repeat(profile[:, None], columns(c.lane_width, c), axis=1).astype(np.float32)
 
 
 def stairs_up(c: config.Terrain, size: float, shape: Stairs, rng: np.random.Generator) -> Heights:
-    """Return a flight of steps up, each rising `size` metres, a landing, and the flight down."""
+    """Generate a flight of steps up, each `size` metres high, a landing and the flight down."""
     tread = rng.choice(shape.tread)
     room = c.lane_length - START - END - shape.landing
     most = min(shape.steps[1], 1 + int(room / (2.0 * tread) + 1e-6))
@@ -132,55 +137,55 @@ def stairs_up(c: config.Terrain, size: float, shape: Stairs, rng: np.random.Gene
     spare = max(0.0, room - 2.0 * tread * (steps - 1))
     start = START + rng.uniform(0.0, min(0.5, spare))  # assumed: not always the same
     flight = [(tread, size * k) for k in range(1, steps)]
-    return _across(c, [(start, 0.0), *flight, (shape.landing, size * steps), *flight[::-1]])
+    return _extrude(c, [(start, 0.0), *flight, (shape.landing, size * steps), *flight[::-1]])
 
 
 def stairs_down(c: config.Terrain, size: float, shape: Stairs, rng: np.random.Generator) -> Heights:
-    """Return a flight of steps down, a landing below, and the flight up to the level before."""
+    """Generate a flight of steps down, a landing, and the flight back up to z = 0."""
     return -stairs_up(c, size, shape, rng)
 
 
 def ascent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Generator) -> Heights:
-    """Return one flight of steps up, each rising `size` metres, and the level above it."""
+    """Generate one flight of steps up, each `size` metres high, and level ground above it."""
     steps = rng.integers(shape.steps[0], shape.steps[1] + 1)
     start = START + rng.uniform(0.0, 0.5)  # assumed: not always the same
     flight = [(start, 0.0), *((shape.tread, size * k) for k in range(1, steps))]
-    _check_length(c, _length(flight, c) + END)
-    return _across(c, flight, last=size * steps)
+    _check_length(c, _total_length(flight, c) + END)
+    return _extrude(c, flight, last=size * steps)
 
 
 def descent(c: config.Terrain, size: float, shape: Flight, rng: np.random.Generator) -> Heights:
-    """Return one flight of steps down, and the level below it."""
+    """Generate one flight of steps down, and level ground below it."""
     return -ascent(c, size, shape, rng)
 
 
 def gap(c: config.Terrain, size: float, shape: Gap, rng: np.random.Generator) -> Heights:
-    """Return level ground cut by equal trenches, `size` metres wide."""
+    """Generate level ground cut by equal trenches, `size` metres wide."""
     sections = []
     for k in range(shape.count):
-        trench = [(_landing(shape.landing, k, rng), 0.0), (size, -shape.depth)]
-        if k > 0 and _length(sections + trench, c) > c.lane_length - END:
+        trench = [(_sample_landing(shape.landing, k, rng), 0.0), (size, -shape.depth)]
+        if k > 0 and _total_length(sections + trench, c) > c.lane_length - END:
             break
         sections += trench
-    _check_length(c, _length(sections, c) + END)
-    return _across(c, sections)
+    _check_length(c, _total_length(sections, c) + END)
+    return _extrude(c, sections)
 
 
 def platform(c: config.Terrain, size: float, shape: Platform, rng: np.random.Generator) -> Heights:
-    """Return level ground with boxes on it, `size` metres high, to step up and down."""
+    """Generate level ground with boxes, `size` metres high, to step onto and off."""
     sections = []
     for k in range(shape.count[1]):
-        landing = _landing(shape.landing, k, rng)
+        landing = _sample_landing(shape.landing, k, rng)
         box = [(landing, 0.0), (rng.uniform(*shape.length), size)]
-        if k >= shape.count[0] and _length(sections + box, c) > c.lane_length - END:
+        if k >= shape.count[0] and _total_length(sections + box, c) > c.lane_length - END:
             break
         sections += box
-    _check_length(c, _length(sections, c) + END)
-    return _across(c, sections)
+    _check_length(c, _total_length(sections, c) + END)
+    return _extrude(c, sections)
 
 
 class Kind(NamedTuple):
-    """A shape and the numbers it needs beside its size."""
+    """A lane generator and the type of its shape parameters."""
 
     heights: Callable[..., Heights]
     shape: type
@@ -199,29 +204,29 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def extent(kind: str, size: float) -> str:
-    """Return a size for people: that of a slope is its gradient, all others are lengths."""
+def format_size(kind: str, size: float) -> str:
+    """Format a size: the gradient of a slope in %, any other size in cm."""
     return f"{100.0 * size:.3g} {'%' if kind == 'slope' else 'cm'}"
 
 
 def columns(metres: float, c: config.Terrain) -> int:
-    """Return how many columns a length takes, rounded up: an obstacle is never made easier."""
+    """Convert a length, m, to columns, rounded up so that no obstacle becomes easier."""
     return int(np.ceil(metres / c.cell - 1e-6))
 
 
-def _centres(c: config.Terrain) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middles of a lane's columns along and across it, from its corner, m."""
+def _column_centres(c: config.Terrain) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the centres of a lane's columns along and across it, m from its corner."""
     middles = lambda metres: (np.arange(columns(metres, c)) + 0.5) * c.cell
     return middles(c.lane_length), middles(c.lane_width)
 
 
-def _landing(span: Range, number: int, rng: np.random.Generator) -> float:
-    """Return the length of level ground before an obstacle of this number, m."""
+def _sample_landing(span: Range, number: int, rng: np.random.Generator) -> float:
+    """Sample the length of level ground before an obstacle, m; number 0 is the first."""
     return max(rng.uniform(*span), 0.0 if number else START)
 
 
-def _across(c: config.Terrain, sections: list[tuple[float, float]], last: float = 0.0) -> Heights:
-    """Return the lane made of (length, height) sections from the start on, then level at `last`."""
+def _extrude(c: config.Terrain, sections: list[tuple[float, float]], last: float = 0.0) -> Heights:
+    """Extrude (length, height) sections, m, from the start; then level at `last` to the end."""
     profile = np.concatenate([np.full(columns(length, c), z) for length, z in sections])
     _check_length(c, profile.size * c.cell)
     rest = columns(c.lane_length, c) - profile.size
@@ -229,12 +234,16 @@ def _across(c: config.Terrain, sections: list[tuple[float, float]], last: float 
     return np.repeat(profile[:, None], columns(c.lane_width, c), axis=1).astype(np.float32)
 
 
-def _length(sections: list[tuple[float, float]], c: config.Terrain) -> float:
-    """Return the length of (length, height) sections in whole columns, m."""
+def _total_length(sections: list[tuple[float, float]], c: config.Terrain) -> float:
+    """Compute the length of (length, height) sections in whole columns, m."""
     return sum(columns(length, c) for length, _ in sections) * c.cell
 
 
 def _check_length(c: config.Terrain, needed: float) -> None:
-    """Refuse a lane that is too short for what it should hold."""
+    """Check that a lane is long enough for its obstacles.
+
+    Raises:
+        ConfigError: it is shorter than `needed`, m.
+    """
     if needed > c.lane_length + 1e-6:
         raise ConfigError(f"lane_length is {c.lane_length:g} m, but {needed:.2f} m are needed")

@@ -1,4 +1,4 @@
-"""A user's own height map, .npy or .png, as a lane."""
+"""A user-supplied height map, .npy or .png, as a lane."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +11,27 @@ from cref_jax.errors import ConfigError
 from cref_jax.terrain import atlas, column_grid, kind_files
 from cref_jax.terrain.atlas import Atlas
 
-MAP_START = 0.75  # m, x of a user's start in the lane's coordinates; assumed: within START
+MAP_START = 0.75  # m, x of the map's start in the lane's coordinates; assumed: within START
 
 
 @dataclass(frozen=True)
 class _MapFile:
-    """The file beside a user's height map."""
+    """The TOML file beside a height map."""
 
     cell: float  # m, side of a column
-    start: tuple[float, float]  # m, from the map's first corner to where the robot starts
-    scale: float  # m for one step of the map's values
+    start: tuple[float, float]  # m, from the map's first corner to the robot's start
+    scale: float  # m per unit of the map's values
 
 
 def read_map(path: Path) -> Atlas:
-    """Return a user's height map as one lane whose start lies at x = MAP_START, y = 0, z = 0.
+    """Read a height map as one lane with its start at x = MAP_START, y = 0, z = 0.
 
-    An array's first axis is x. A picture is seen from above: x to the right, y up.
+    An array's first axis is x. A picture is a view from above: x to the right, y up.
+
+    Raises:
+        ConfigError: the map or the TOML file beside it is missing or unusable.
     """
-    heights = _picture(path) if path.suffix == ".png" else _array(path)
+    heights = _read_picture(path) if path.suffix == ".png" else _read_array(path)
     file_path = path.with_suffix(".toml")
     table = config.load_toml(file_path)
     file = kind_files.read_record(
@@ -42,14 +45,14 @@ def read_map(path: Path) -> Atlas:
         raise ConfigError(f"{file_path.name}: start {list(file.start)} is not on the map, {size} m")
     heights = (heights - heights[start]) * file.scale
     origin = (MAP_START - file.start[0], -file.start[1])
-    grid = column_grid.grid([[heights.astype(np.float32)]], file.cell, origin, heights.shape)
+    grid = column_grid.build_grid([[heights.astype(np.float32)]], file.cell, origin, heights.shape)
     is_profile = bool((heights == heights[:, :1]).all())
     nowhere = np.full((1, 1, 1, 2), np.nan, np.float32)
     return Atlas(grid, nowhere, np.zeros((1, 1)), ("custom",), (is_profile,), (0,))
 
 
-def _array(path: Path) -> np.ndarray:
-    """Return the heights in a .npy file, f64[X, Y]."""
+def _read_array(path: Path) -> np.ndarray:
+    """Read the heights in a .npy file, f64[X, Y]."""
     try:
         heights = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
@@ -65,8 +68,8 @@ def _array(path: Path) -> np.ndarray:
     return heights
 
 
-def _picture(path: Path) -> np.ndarray:
-    """Return the values of a grey .png of 8 or 16 bits, f64[X, Y]."""
+def _read_picture(path: Path) -> np.ndarray:
+    """Read the values of a grey .png of 8 or 16 bits, f64[X, Y]."""
     try:
         with Image.open(path) as image:
             atlas.check_columns(image.size, str(path))

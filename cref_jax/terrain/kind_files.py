@@ -1,8 +1,6 @@
-"""The numbers of each kind of lane, read from the TOML files in `terrains/`."""
+"""Parameters of each kind of lane, read from the TOML files in `terrains/`."""
 
 import dataclasses
-import difflib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,12 +27,12 @@ class _Levels:
 
 
 class KindNumbers(NamedTuple):
-    """What a terrain file says about a kind."""
+    """Parameters of one kind in a terrain file."""
 
     train: Range  # m, size at the lowest and the highest level
     levels: _Levels | None  # m, sizes for evaluation
-    shape: Any  # the record that KINDS names
-    practice: Any  # the same for the lanes of training
+    shape: Any  # an instance of the kind's `shape` type in KINDS
+    practice: Any  # the same for training lanes
 
 
 @dataclass(frozen=True)
@@ -45,43 +43,47 @@ class _KindsFile:
     train: Range
     levels: dict
     shape: dict
-    practice: dict  # what differs from the shape on the lanes of training
+    practice: dict  # overrides of the shape on training lanes
 
 
 @dataclass(frozen=True)
 class _MixFile:
-    """A terrain file that takes all kinds of other ones."""
+    """A terrain file that combines all kinds of other files."""
 
     mix: tuple[str, ...]
-    shares: dict  # robots on each kind of a file, of those on a kind whose file is not named
+    shares: dict  # relative number of robots per kind of a file; 1 if not listed
 
 
 def read_kinds(name: str) -> dict[str, KindNumbers]:
-    """Return what a terrain, named or given by its file, says about each of its kinds."""
-    table, where = _table(name)
+    """Read the parameters of each kind of a terrain, given by name or by file.
+
+    Raises:
+        ConfigError: no such terrain, or an unusable file.
+    """
+    table, where = _load_table(name)
     if "mix" not in table:
-        return _kinds(table, where)
+        return _parse_kinds(table, where)
     numbers: dict[str, KindNumbers] = {}
-    for part in _mix(table, where).mix:
-        numbers |= _kinds(*_table(part))
+    for part in _parse_mix(table, where).mix:
+        numbers |= _parse_kinds(*_load_table(part))
     if not numbers:
         raise ConfigError(f"{where}: mix must name at least one terrain")
     return numbers
 
 
 def round_robin_kinds(name: str, kinds: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the kinds that robots are put on in turn, as often as the terrain's shares ask for."""
-    table, where = _table(name)
+    """Compute the round-robin order of kinds, each repeated by its share."""
+    table, where = _load_table(name)
     share = dict.fromkeys(kinds, 1)
     if "mix" in table:
-        for part, count in _mix(table, where).shares.items():
-            share |= dict.fromkeys(_kinds(*_table(part)), count)
+        for part, count in _parse_mix(table, where).shares.items():
+            share |= dict.fromkeys(_parse_kinds(*_load_table(part)), count)
     rounds = range(max(share.values()))
     return tuple(k for r in rounds for k, kind in enumerate(kinds) if r < share[kind])
 
 
-def _mix(table: dict[str, Any], where: str) -> _MixFile:
-    """Return what a terrain file says that takes all kinds of other ones."""
+def _parse_mix(table: dict[str, Any], where: str) -> _MixFile:
+    """Parse the tables of a terrain file that combines other files."""
     file = read_record(_MixFile, {"shares": {}} | table, where)
     for part, count in file.shares.items():
         if part not in file.mix:
@@ -91,21 +93,21 @@ def _mix(table: dict[str, Any], where: str) -> _MixFile:
     return file
 
 
-def _table(name: str) -> tuple[dict[str, Any], str]:
-    """Return the tables and the file name of a terrain, named or given by its file."""
+def _load_table(name: str) -> tuple[dict[str, Any], str]:
+    """Load the tables and the file name of a terrain, given by name or by file."""
     path = Path(name)
     if path.suffix != ".toml":
         known = terrain_names()
         if name not in known:
-            raise _unknown("terrain", name, known)
+            raise ConfigError(config.describe_unknown("terrain", name, known))
         path = folders.data_folder("terrains") / f"{name}.toml"
     return config.load_toml(path), path.name
 
 
 def read_kind(c: config.Terrain, kind: str) -> KindNumbers:
-    """Return the numbers of one kind, from the terrain's own file or from that which defines it."""
+    """Read the parameters of one kind, from the terrain's own file or a default that defines it."""
     if kind not in KINDS:
-        raise _unknown("kind", kind, KINDS)
+        raise ConfigError(config.describe_unknown("kind", kind, list(KINDS)))
     for name in [c.name, "mixed", "flight"]:
         numbers = {} if Path(name).suffix in (".npy", ".png") else read_kinds(name)
         if kind in numbers:
@@ -113,8 +115,8 @@ def read_kind(c: config.Terrain, kind: str) -> KindNumbers:
     raise ConfigError(f"neither '{c.name}' nor 'mixed' nor 'flight' has the kind '{kind}'")
 
 
-def _kinds(table: dict[str, Any], where: str) -> dict[str, KindNumbers]:
-    """Return the numbers in the tables of a terrain file that defines kinds."""
+def _parse_kinds(table: dict[str, Any], where: str) -> dict[str, KindNumbers]:
+    """Parse the tables of a terrain file that defines kinds."""
     if "mix" in table:
         raise ConfigError(f"{where} is a mix itself; a mix names terrains that define kinds")
     file = read_record(_KindsFile, {"levels": {}, "shape": {}, "practice": {}} | table, where)
@@ -126,18 +128,18 @@ def _kinds(table: dict[str, Any], where: str) -> dict[str, KindNumbers]:
     numbers = {}
     for kind in file.kinds:
         if kind not in KINDS:
-            raise _unknown("kind", kind, KINDS)
-        shape = _shape(kind, file.shape, f"{where}: shape")
-        practice = _shape(kind, file.shape | file.practice, f"{where}: practice")
+            raise ConfigError(config.describe_unknown("kind", kind, list(KINDS)))
+        shape = _parse_shape(kind, file.shape, f"{where}: shape")
+        practice = _parse_shape(kind, file.shape | file.practice, f"{where}: practice")
         numbers[kind] = KindNumbers(file.train, levels, shape, practice)
     return numbers
 
 
-def _shape(kind: str, table: dict[str, Any], where: str) -> Any:
-    """Return the record that a kind's shape is drawn from.
+def _parse_shape(kind: str, table: dict[str, Any], where: str) -> Any:
+    """Parse the shape parameters of a kind.
 
     Raises:
-        ConfigError: numbers that no lane can be made of.
+        ConfigError: a value is not above zero, or a list is not rising.
     """
     shape = read_record(KINDS[kind].shape, table, where)
     for key, value in table.items():
@@ -148,16 +150,9 @@ def _shape(kind: str, table: dict[str, Any], where: str) -> Any:
 
 
 def read_record(cls: type, table: dict[str, Any], where: str) -> Any:
-    """Return a table as the record `cls`, every field of which it must give."""
+    """Parse a table as the record `cls`; every field is required."""
     names = {f.name for f in dataclasses.fields(cls)}
     missing = sorted(names - table.keys())
     if missing and table.keys() <= names:
         raise ConfigError(f"{where}: '{missing[0]}' is missing")
     return config.override(object.__new__(cls), table, where=f"{where}: ")
-
-
-def _unknown(what: str, name: str, known: Iterable[str]) -> ConfigError:
-    """Return the error that names what is nearest to an unknown name."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    hint = f"did you mean '{near[0]}'? " if near else ""
-    return ConfigError(f"unknown {what} '{name}'; {hint}known: {', '.join(known)}")

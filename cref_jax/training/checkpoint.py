@@ -1,9 +1,9 @@
-"""The whole state of a run on disk: orbax for the arrays, JSON for where they come from.
+"""Checkpoints of the whole state of a run: orbax for the arrays, JSON for their origin.
 
-A step is one directory, complete or absent. What orbax leaves open is closed here. It notices
-neither a flipped bit nor a changed dtype, so every leaf carries its SHA-256. Its manager skips a
-save without a word while a directory has a higher number, and deletes directories that it did not
-write, so steps are listed and pruned here.
+A step is one directory, complete or absent. This module closes gaps in orbax, which detects neither
+a flipped bit nor a changed dtype: every leaf carries its SHA-256. Orbax's manager silently skips a
+save if a directory has a higher number, and deletes directories that it did not write: steps are
+listed and pruned here.
 """
 
 import contextlib
@@ -31,13 +31,13 @@ from cref_jax.errors import CheckpointError, DamagedCheckpoint
 from cref_jax.training import pytree_digest
 
 LOG = logging.getLogger(__name__)
-SCHEMA = 1  # one more whenever this program would misread a step of the next one
+SCHEMA = 1  # to be incremented when an older program would misread a new step
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "numpy")
 LEFTOVER = re.compile(r"\d+\.(new|old)(\.orbax-checkpoint-tmp.*)?")
 
 
 class Loaded(NamedTuple):
-    """What was read of one step."""
+    """The contents of one step."""
 
     step: int
     arrays: dict[str, Any]  # by path in the state
@@ -45,13 +45,13 @@ class Loaded(NamedTuple):
 
 
 class Checkpoints:
-    """The steps of one run, of which the newest `keep` stay. Reading changes nothing on disk."""
+    """The steps of one run; the newest `keep` are kept. Reading changes nothing on disk."""
 
     def __init__(self, directory: str | os.PathLike[str], keep: int = 3) -> None:
-        self.directory = Path(directory).absolute()  # orbax takes no other
+        self.directory = Path(directory).absolute()  # as orbax requires
         self.keep = keep
-        self._stands_on = -1  # the step that this run wrote or restored last
-        self._foreign: set[Path] = set()  # warned about
+        self._current_step = -1  # last written or restored by this run
+        self._foreign: set[Path] = set()  # numbered directories already warned about
         self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
 
     def __enter__(self) -> "Checkpoints":
@@ -61,21 +61,21 @@ class Checkpoints:
         self.close()
 
     def close(self) -> None:
-        """Let go of orbax's threads."""
+        """Stop orbax's threads."""
         self._orbax.close()
 
     def steps(self) -> list[int]:
-        """Return the steps on disk, oldest first. Numbered directories of others get a warning."""
-        found = []
+        """List the steps on disk, oldest first. Other numbered directories get a warning."""
+        steps = []
         for path in self.directory.glob("*"):
             if not re.fullmatch(r"0|[1-9][0-9]*", path.name):
                 continue
             if (path / "state").is_dir() or (path / "meta").is_dir():
-                found.append(int(path.name))
+                steps.append(int(path.name))
             elif path not in self._foreign:
                 self._foreign.add(path)
-                LOG.warning("%s is no checkpoint; skipped", path)
-        return sorted(found)
+                LOG.warning("%s is not a checkpoint; skipped", path)
+        return sorted(steps)
 
     def latest(self) -> int | None:
         """Return the newest step on disk, or None."""
@@ -84,29 +84,31 @@ class Checkpoints:
     def save(self, iteration: int, carry: PyTree, meta: dict[str, Any]) -> None:
         """Write `carry` and `meta` (JSON); on return the step is complete on disk.
 
-        A run stands on the step that it wrote or restored last. Newer ones belong to a future that
-        it has left: they are renamed to `<step>.aside-<time>`, never deleted.
+        A run's current step is the one it wrote or restored last. Newer ones belong to an abandoned
+        future: they are renamed to `<step>.aside-<time>`, never deleted.
 
         Raises:
-            CheckpointError: the disk refused, or the directory holds the steps of another run.
+            CheckpointError: writing failed, or the directory contains the steps of another run.
         """
         host = pytree_digest.on_host(carry)
         index = pytree_digest.describe(carry, host)
-        if iteration == self._stands_on and self._holds(iteration, index):
+        if iteration == self._current_step and self._holds(iteration, index):
             return
-        own = {"schema": SCHEMA, "iteration": iteration, "versions": _versions()}
-        record = json.loads(json.dumps({**meta, **own, "devices": _devices(), "leaves": index}))
+        own = {"schema": SCHEMA, "iteration": iteration, "versions": _package_versions()}
+        record = json.loads(
+            json.dumps({**meta, **own, "devices": _describe_devices(), "leaves": index})
+        )
         try:
             self._write(iteration, host, record)
         except CheckpointError:
             raise
         except Exception as error:  # orbax and TensorStore raise many kinds
             step = self.directory / str(iteration)
-            raise CheckpointError(f"{step}: could not be written: {_line(error)}") from error
+            raise CheckpointError(f"{step}: could not be written: {_first_line(error)}") from error
 
     def meta(self, step: int | None = None) -> dict[str, Any]:
-        """Return the `meta` of a step together with its iteration, schema, versions and devices."""
-        return _public(self._record(self._candidates(step)[0]))
+        """Read the `meta` of a step, with its iteration, schema, versions and devices."""
+        return _without_leaves(self._record(self._candidates(step)[0]))
 
     def restore(
         self,
@@ -115,82 +117,83 @@ class Checkpoints:
         parts: Sequence[str] | None = None,
         allow_fallback: bool = False,
     ) -> tuple[PyTree, dict[str, Any]]:
-        """Return the stored state and its meta; the run then stands on this step.
+        """Load the stored state and its meta; this becomes the run's current step.
 
         Args:
             like: a fresh state of the same structure, shapes and dtypes; its shardings are used.
-            step: the newest one when None.
-            parts: names at the top of the state, such as ("params", "optimiser"). Only these are
-                read and the rest of `like` comes back as it is: the way to go on with another
-                number of environments.
+            step: the newest one if None.
+            parts: top-level names of the state, such as ("params", "optimiser"). Only these are
+                read; the rest of `like` is returned unchanged, to continue with another number of
+                environments.
             allow_fallback: log a damaged step and try the one before it.
 
         Raises:
-            DamagedCheckpoint: the files are not what was written.
+            DamagedCheckpoint: the files differ from those written.
             CheckpointError: no step, a newer schema, or a leaf of another shape or dtype.
         """
         every = pytree_digest.by_path(like)
-        unknown = [part for part in parts or () if not any(_within(p, [part]) for p in every)]
+        unknown = [part for part in parts or () if not any(_is_within(p, [part]) for p in every)]
         if unknown:
             raise CheckpointError(f"the state has no part '{unknown[0]}'")
-        wanted = {path: leaf for path, leaf in every.items() if _within(path, parts)}
+        wanted = {path: leaf for path, leaf in every.items() if _is_within(path, parts)}
         loaded = self._load(wanted, parts, step, allow_fallback)
-        self._stands_on = loaded.step
+        self._current_step = loaded.step
         self._warn_if_moved(loaded)
-        return pytree_digest.fill_from(like, loaded.arrays), _public(loaded.record)
+        return pytree_digest.fill_from(like, loaded.arrays), _without_leaves(loaded.record)
 
     def restore_part(
         self, name: str, like: PyTree, step: int | None = None, allow_fallback: bool = False
     ) -> PyTree:
-        """Return one part of the stored state, "params" say, for a reader that needs no more.
+        """Load one part of the stored state, such as "params".
 
-        `like` has the structure of the part; what `jax.eval_shape` returns will do.
+        `like` has the structure of the part; the result of `jax.eval_shape` is enough.
         """
         loaded = self._load(pytree_digest.by_path(like, name), (name,), step, allow_fallback)
         return pytree_digest.fill_from(like, loaded.arrays, name)
 
     def _write(self, iteration: int, host: dict[str, np.ndarray], record: dict[str, Any]) -> None:
-        """Write beside the other steps, then rename: a kill at any time costs one save at most."""
+        """Write to a temporary directory, then rename it: a kill loses at most one save."""
         self.directory.mkdir(parents=True, exist_ok=True)
         self._sweep()
         newest = self.latest()
-        if self._stands_on < 0 and newest is not None:
+        if self._current_step < 0 and newest is not None:
             raise CheckpointError(
-                f"{self.directory}: holds step {newest} of another run; resume it or go elsewhere"
+                f"{self.directory}: contains step {newest} of another run; resume that run "
+                "or choose another directory"
             )
         staged, final = (self.directory / f"{iteration}{suffix}" for suffix in (".new", ""))
         content = ocp.args.Composite(
             state=ocp.args.PyTreeSave({p: x for p, x in host.items() if x.size}),  # refuses size 0
-            meta=ocp.args.JsonSave({"sha256": _seal(record), "record": record}),
+            meta=ocp.args.JsonSave({"sha256": _record_digest(record), "record": record}),
         )
         self._orbax.save(staged, content)
         for step in self.steps():
-            if step > self._stands_on or step == iteration:
+            if step > self._current_step or step == iteration:
                 _set_aside(self.directory / str(step))
-        if final.exists():  # of someone else
+        if final.exists():  # not a checkpoint
             _set_aside(final)
         staged.rename(final)
-        self._stands_on = iteration
+        self._current_step = iteration
         for step in self.steps()[: -self.keep]:
             old = self.directory / f"{step}.old"
             (self.directory / str(step)).rename(old)
             shutil.rmtree(old)
 
     def _sweep(self) -> None:
-        """Remove what an interrupted save or removal has left."""
+        """Remove the leftovers of an interrupted save or removal."""
         for path in self.directory.glob("*"):
             if LEFTOVER.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
 
     def _holds(self, step: int, index: dict[str, Any]) -> bool:
-        """Say whether `step` already holds the state that `index` describes."""
+        """Check whether `step` already contains the state that `index` describes."""
         try:
             return self._record(step)["leaves"] == index
         except CheckpointError:
             return False
 
     def _candidates(self, step: int | None) -> list[int]:
-        """Return the steps to try, best first."""
+        """List the steps to try, newest first."""
         steps = [known for known in reversed(self.steps()) if step is None or known <= step]
         if not steps:
             raise CheckpointError(f"{self.directory}: no checkpoint")
@@ -205,7 +208,7 @@ class Checkpoints:
         step: int | None,
         allow_fallback: bool,
     ) -> Loaded:
-        """Return the `wanted` leaves of `step`, or of the first older one that reads well."""
+        """Load the `wanted` leaves of `step`, or of the first older step that is intact."""
         candidates = self._candidates(step)
         for older in [*candidates[1:], None]:
             try:
@@ -218,29 +221,33 @@ class Checkpoints:
         raise AssertionError("the last candidate returns or raises")
 
     def _record(self, step: int) -> dict[str, Any]:
-        """Return what was written beside the arrays of `step`, its own digest checked."""
+        """Read the record stored with the arrays of `step` and check its digest."""
         path = self.directory / str(step)
         try:
             sealed = self._orbax.restore(path, ocp.args.Composite(meta=ocp.args.JsonRestore())).meta
             seal, record = sealed["sha256"], sealed["record"]
             schema = int(record["schema"])
         except Exception as error:
-            raise DamagedCheckpoint(f"{path}: the record is damaged: {_line(error)}") from error
-        if seal != _seal(record):
+            raise DamagedCheckpoint(
+                f"{path}: the record is damaged: {_first_line(error)}"
+            ) from error
+        if seal != _record_digest(record):
             raise DamagedCheckpoint(f"{path}: the record is damaged: its digest differs")
         if schema > SCHEMA:
             raise CheckpointError(
-                f"{path}: written by a newer program (schema {schema}, this one knows {SCHEMA})"
+                f"{path}: written by a newer program (schema {schema}, this one reads {SCHEMA})"
             )
         return record
 
     def _read(self, step: int, wanted: dict[str, Any], parts: Sequence[str] | None) -> Loaded:
-        """Return the `wanted` leaves of `step`, each of the right bits, on the right device."""
+        """Read the `wanted` leaves of `step`, check their digests and put them on their devices."""
         path = self.directory / str(step)
         record = self._record(step)
-        index = {key: leaf for key, leaf in record["leaves"].items() if _within(key, parts)}
-        _compare(path, wanted, index)
-        empty = {key: pytree_digest.empty(like) for key, like in wanted.items() if 0 in like.shape}
+        index = {key: leaf for key, leaf in record["leaves"].items() if _is_within(key, parts)}
+        _check_leaves(path, wanted, index)
+        empty = {
+            key: pytree_digest.empty_like(like) for key, like in wanted.items() if 0 in like.shape
+        }
         stored = {key: 0 for key in wanted if key not in empty}
         request = ocp.args.PyTreeRestore(
             item=stored,
@@ -248,10 +255,10 @@ class Checkpoints:
             partial_restore=True,
         )
         try:
-            found = self._orbax.restore(path, ocp.args.Composite(state=request)).state
+            restored = self._orbax.restore(path, ocp.args.Composite(state=request)).state
         except Exception as error:  # orbax and TensorStore raise many kinds
-            raise DamagedCheckpoint(f"{path}: damaged: {_line(error)}") from error
-        host = {key: np.asarray({**found, **empty}.get(key)) for key in index}
+            raise DamagedCheckpoint(f"{path}: damaged: {_first_line(error)}") from error
+        host = {key: np.asarray({**restored, **empty}.get(key)) for key in index}
         for key, leaf in index.items():
             if pytree_digest.bits_digest(host[key]) != leaf["sha256"]:
                 raise DamagedCheckpoint(f"{path}: damaged: the digest of {key} differs")
@@ -262,22 +269,22 @@ class Checkpoints:
         return Loaded(step, arrays, record)
 
     def _warn_if_moved(self, loaded: Loaded) -> None:
-        """Say what has changed since the save, because the run goes on, but not bit for bit."""
-        there = {**loaded.record["versions"], "devices": loaded.record["devices"]}
-        here = {**_versions(), "devices": _devices()}
-        changed = [name for name in here if there.get(name) != here[name]]
-        moved = ", ".join(f"{name} {there.get(name)} -> {here[name]}" for name in changed)
-        if moved:
+        """Warn of changes since the save: the run continues, but not bit for bit."""
+        stored = {**loaded.record["versions"], "devices": loaded.record["devices"]}
+        here = {**_package_versions(), "devices": _describe_devices()}
+        changed = [name for name in here if stored.get(name) != here[name]]
+        changes = ", ".join(f"{name} {stored.get(name)} -> {here[name]}" for name in changed)
+        if changes:
             step = self.directory / str(loaded.step)
-            LOG.warning("%s: goes on, but not bit for bit: %s", step, moved)
+            LOG.warning("%s: continues, but not bit for bit: %s", step, changes)
 
 
 @contextlib.contextmanager
 def lock(directory: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold `run.lock` in `directory`, made if missing, so that no second run writes there.
+    """Hold `run.lock` in `directory`, created if missing, so that no second run writes there.
 
-    The kernel frees the lock when its process dies, however it dies. The pid and the host in the
-    file serve the message, and file systems that have no locks or that other hosts write to.
+    The kernel frees the lock however its process dies. The pid and host in the file are for the
+    message, and for file systems without locks or shared with other hosts.
 
     Raises:
         CheckpointError: another run holds it, or the directory cannot be written.
@@ -287,17 +294,17 @@ def lock(directory: str | os.PathLike[str]) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.open("a+", encoding="utf-8")
     except OSError as error:
-        raise CheckpointError(f"{path.parent}: cannot be written: {_line(error)}") from error
+        raise CheckpointError(f"{path.parent}: cannot be written: {_first_line(error)}") from error
     with file:
-        _take(file, path)
+        _take_lock(file, path)
         try:
             yield
         finally:
             file.truncate(0)  # not removed: a waiting run may have the file open
 
 
-def _take(file: TextIO, path: Path) -> None:
-    """Lock `file` and write our name into it."""
+def _take_lock(file: TextIO, path: Path) -> None:
+    """Lock `file` and write our pid and host into it."""
     locks = True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -308,10 +315,10 @@ def _take(file: TextIO, path: Path) -> None:
         locks = held = False
     file.seek(0)
     pid, _, host = file.read(1000).strip().partition(" ")
-    dead = host == socket.gethostname() and (locks or not _alive(pid))
+    dead = host == socket.gethostname() and (locks or not _is_alive(pid))
     if held or (host and not dead):
         raise CheckpointError(
-            f"{path.parent}: in use by process {pid} on {host}; if that is dead, remove {path}"
+            f"{path.parent}: in use by process {pid} on {host}; if it is dead, remove {path}"
         )
     if host:
         LOG.warning("%s: taken over from process %s, which died", path, pid)
@@ -320,8 +327,8 @@ def _take(file: TextIO, path: Path) -> None:
     file.flush()
 
 
-def _alive(pid: str) -> bool:
-    """Say whether a process of this host has the number `pid`."""
+def _is_alive(pid: str) -> bool:
+    """Check whether a process with this pid runs on this host."""
     try:
         os.kill(int(pid), 0)
     except (ProcessLookupError, ValueError, OverflowError):
@@ -331,29 +338,29 @@ def _alive(pid: str) -> bool:
     return True
 
 
-def _within(path: str, parts: Sequence[str] | None) -> bool:
-    """Say whether `path` lies in one of `parts`; None stands for all there is."""
+def _is_within(path: str, parts: Sequence[str] | None) -> bool:
+    """Check whether `path` lies in one of `parts`; None means everything."""
     return parts is None or any(path == part or path.startswith(f"{part}/") for part in parts)
 
 
-def _compare(path: Path, wanted: dict[str, Any], index: dict[str, Any]) -> None:
-    """Raise if the stored leaves are not those wanted, with the first difference."""
+def _check_leaves(path: Path, wanted: dict[str, Any], index: dict[str, Any]) -> None:
+    """Check that the stored leaves match those wanted; report the first difference."""
     text = lambda shape, dtype: f"{dtype}{list(shape)}"
     here = {key: text(leaf.shape, leaf.dtype) for key, leaf in wanted.items()}
-    there = {key: text(leaf["shape"], leaf["dtype"]) for key, leaf in index.items()}
-    differing = [key for key in here | there if here.get(key) != there.get(key)]
+    stored = {key: text(leaf["shape"], leaf["dtype"]) for key, leaf in index.items()}
+    differing = [key for key in here | stored if here.get(key) != stored.get(key)]
     if differing:
         key, *others = differing
-        sides = f"{there.get(key, 'absent')} there, {here.get(key, 'absent')} here"
+        sides = f"{stored.get(key, 'absent')} on disk, {here.get(key, 'absent')} here"
         more = f" (and {len(others)} more)" if others else ""
         raise CheckpointError(f"{path}: {key} is {sides}{more}")
 
 
-def _seal(record: dict[str, Any]) -> str:
+def _record_digest(record: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
-def _public(record: dict[str, Any]) -> dict[str, Any]:
+def _without_leaves(record: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in record.items() if key != "leaves"}
 
 
@@ -363,7 +370,7 @@ def _set_aside(path: Path) -> None:
     LOG.warning("%s set aside as %s", path, aside.name)
 
 
-def _versions() -> dict[str, str]:
+def _package_versions() -> dict[str, str]:
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -371,11 +378,11 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _devices() -> str:
+def _describe_devices() -> str:
     return f"{jax.device_count()} x {jax.devices()[0].device_kind}"
 
 
-def _line(error: BaseException) -> str:
-    """Return the first line of what `error` says, short enough for a terminal."""
+def _first_line(error: BaseException) -> str:
+    """Shorten `error` to one line for a terminal: its type and the start of its message."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:160]}" if lines else type(error).__name__

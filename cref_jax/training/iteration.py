@@ -1,10 +1,10 @@
-"""One iteration of training, and many of them as one compiled program.
+"""One iteration of training, and a chunk of iterations as one compiled program.
 
-An iteration is a horizon of experience and an update. Its random numbers come from the seed and the
-number of the iteration, so neither the length of a chunk nor a resumption changes any result.
+An iteration is one horizon of experience and one update. Its random numbers depend only on the seed
+and the iteration number, so neither the chunk length nor a resumption changes any result.
 
-The robots are shared out among the devices of a mesh. Each collects and learns from its own, and
-they agree on every gradient, so that all of them hold the same parameters.
+The robots are sharded over the devices of a mesh. Each device collects experience from its own
+robots; gradients are averaged, so all devices hold the same parameters.
 """
 
 import functools
@@ -23,65 +23,65 @@ from cref_jax.ppo import Losses
 from cref_jax.training import mirror, randomization_ramp, rollout
 from cref_jax.training.randomization_ramp import Ramp
 
-Log = dict[str, Float[Array, "*n"]]  # one number an iteration under each name
+Log = dict[str, Float[Array, "*n"]]  # by name, one number per iteration
 
 AXIS = "robots"  # of the mesh
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map fill it with batches and with non-arrays
 @flax.struct.dataclass
 class RunState:
-    """Everything that a run carries from one iteration to the next."""
+    """The state of a run between iterations."""
 
     train: ppo.TrainState
     robots: rollout.Robots
     ramp: Ramp
 
 
-def mesh_of(count: int = 1) -> Mesh:
-    """Return the first `count` devices."""
+def make_mesh(count: int = 1) -> Mesh:
+    """Make a mesh of the first `count` devices."""
     devices = jax.devices()[:count]
     return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
 def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
-    """Return the state before the first iteration; without a mesh, for one device."""
-    c, mesh = world.config, mesh or mesh_of()
+    """Create the state before the first iteration; without a mesh, for one device."""
+    c, mesh = world.config, mesh or make_mesh()
     key_robots, key_params = jax.random.split(jax.random.key(c.run.seed))
 
     def start(world: World, key: Array) -> rollout.Robots:
         robots = rollout.start(world, _device_key(key), c.run.num_envs // mesh.size)
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
-    shared = jax.shard_map(
+    sharded_start = jax.shard_map(
         start,
         mesh=mesh,
         in_specs=(P(), P()),
         out_specs=partition(world).robots,
         check_vma=False,
     )
-    robots = shared(world, key_robots)
-    seen = robots.observation
-    joints = len(world.physics.robot.joint_names)
+    robots = sharded_start(world, key_robots)
+    observation = robots.observation
+    joints = world.physics.robot.num_joints
     params = rollout.initial_params(c, joints, robots, key_params)
-    sizes = seen.proprioception.shape[-1], seen.privileged.shape[-1]
+    sizes = observation.proprioception.shape[-1], observation.privileged.shape[-1]
     train = ppo.initial_state(params, *sizes, c.ppo)
     whole = NamedSharding(mesh, P())
-    train, growing = jax.lax.with_sharding_constraint(
+    train, ramp = jax.lax.with_sharding_constraint(
         (train, randomization_ramp.initial_ramp(c.randomisation)), (whole, whole)
     )
-    return RunState(train, robots, growing)
+    return RunState(train, robots, ramp)
 
 
-def shapes(world: World, mesh: Mesh) -> RunState:
-    """Return the shapes of a run's state and how it is shared out, without an array."""
+def state_shapes(world: World, mesh: Mesh) -> RunState:
+    """Compute the shapes and shardings of a run's state without allocating it."""
 
-    def shared(spec: P, part: PyTree) -> PyTree:
+    def with_sharding(spec: P, part: PyTree) -> PyTree:
         place = NamedSharding(mesh, spec)
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=place), part)
 
     state = jax.eval_shape(functools.partial(initial_state, mesh=mesh), world)
-    return jax.tree.map(shared, partition(world), state, is_leaf=lambda x: isinstance(x, P))
+    return jax.tree.map(with_sharding, partition(world), state, is_leaf=lambda x: isinstance(x, P))
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "iterations"), donate_argnames="state")
@@ -97,9 +97,9 @@ def chunk(world: World, state: RunState, mesh: Mesh, iterations: int) -> tuple[R
 
 def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[RunState, Log]:
     c = world.config
-    nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
+    nets = rollout.networks(c.network, world.physics.robot.num_joints)
     if c.ppo.mirror_weight:
-        nets = nets._replace(mirror=mirror.of(world.physics.model, c.network))
+        nets = nets._replace(mirror=mirror.make_mirror(world.physics.model, c.network))
 
     def learn(world: World, state: RunState, key: Array) -> tuple[RunState, Losses, rollout.Trace]:
         key_act, key_update = jax.random.split(_device_key(key))
@@ -109,7 +109,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         return state.replace(train=train, robots=robots), losses, trace
 
     parts = partition(world)
-    shared = jax.shard_map(
+    sharded_learn = jax.shard_map(
         learn,
         mesh=mesh,
         in_specs=(P(), parts, P()),
@@ -118,7 +118,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     )
     std = jnp.exp(state.train.params.actor["params"]["log_std"])
     std = jnp.maximum(std, c.network.min_std)
-    state, losses, trace = shared(world, state, key)
+    state, losses, trace = sharded_learn(world, state, key)
     falls = trace.ending.terminated.mean() * (60.0 / c.physics.control_period)
     state = state.replace(ramp=randomization_ramp.update_ramp(state.ramp, falls, c.randomisation))
     samples = state.train.iteration * (c.run.num_envs * c.ppo.horizon)
@@ -135,29 +135,29 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
 
 
 def partition(world: World) -> RunState:
-    """Return how a run's state is shared out: the robots are, and what is learned is not."""
+    """Return the partition specs of a run's state: robots are sharded, the rest is replicated."""
     c = world.config
     robots = rollout.partition(AXIS, c.network.variant, c.ppo.mirror_weight > 0.0)
     return RunState(train=P(), robots=robots, ramp=P())
 
 
 def _device_key(key: Array) -> Array:
-    """Return this device's own key."""
+    """Derive this device's own key."""
     return jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
 
 def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:
-    """Return how the robots walk, and how the episodes that ended did, by kind of terrain.
+    """Compute the log of the steps and of the episodes that ended, partly by kind of terrain.
 
     `period` is the length of a control step, s.
     """
     ending, measures = trace.ending, trace.measures
     over = ending.terminated | ending.truncated
-    among = lambda x, which: jnp.sum(x * which) / jnp.maximum(which.sum(), 1)
+    masked_mean = lambda x, which: jnp.sum(x * which) / jnp.maximum(which.sum(), 1)
     distance = measures.foothold_distance
     placed = measures.touchdown & jnp.isfinite(distance)
     log = {
-        "episode/length_s": among(measures.steps * period, over),
+        "episode/length_s": masked_mean(measures.steps * period, over),
         "episode/ended": over.sum().astype(jnp.float32),
         "episode/fell": ending.terminated.sum().astype(jnp.float32),
         "episode/falls_per_minute": ending.terminated.mean() * (60.0 / period),
@@ -166,11 +166,11 @@ def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) ->
         "walk/forward_speed": measures.forward_speed.mean(),
         "walk/airborne": measures.airborne.mean(),
         "walk/reward": trace.reward.mean(),
-        "foothold/distance": among(jnp.where(placed, distance, 0.0), placed),
-        "foothold/empty": among(~jnp.isfinite(distance), measures.touchdown),
+        "foothold/distance": masked_mean(jnp.where(placed, distance, 0.0), placed),
+        "foothold/empty": masked_mean(~jnp.isfinite(distance), measures.touchdown),
     }
     for number, kind in enumerate(kinds):
         here = measures.kind == number
-        log[f"level/{kind}"] = among(measures.rank, here)
-        log[f"fell/{kind}"] = among(ending.terminated, here & over)
+        log[f"level/{kind}"] = masked_mean(measures.rank, here)
+        log[f"fell/{kind}"] = masked_mean(ending.terminated, here & over)
     return log

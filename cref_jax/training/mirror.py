@@ -1,8 +1,8 @@
-"""The robot and the world in a mirror that stands along its way: left becomes right.
+"""Reflection of the robot and the world in the sagittal plane: left becomes right.
 
-y and the rotations about x and z change sign, left joints and feet change places with right ones,
-and images are turned over. The robot and every lane that is level across are their own mirror
-image, so what a state does in a step is what its mirror image does, mirrored.
+y and the rotations about x and z change sign, left joints and feet swap with right ones, and images
+are flipped left to right. The robot and every lane that is level across are symmetric, so stepping
+commutes with mirroring.
 """
 
 import functools
@@ -18,29 +18,29 @@ from cref_jax.env import observations
 from cref_jax.physics.records import Body
 from cref_jax.ppo import Mirror
 
-POLAR = np.array([1.0, -1.0, 1.0], np.float32)  # of a velocity, a force, a place
-AXIAL = np.array([-1.0, 1.0, -1.0], np.float32)  # of a rotation
-ROTATION = np.array([1.0, -1.0, 1.0, -1.0], np.float32)  # of a quaternion w, x, y, z
+POLAR = np.array([1.0, -1.0, 1.0], np.float32)  # signs of a velocity, force or position
+AXIAL = np.array([-1.0, 1.0, -1.0], np.float32)  # signs of a rotation
+ROTATION = np.array([1.0, -1.0, 1.0, -1.0], np.float32)  # signs of a quaternion w, x, y, z
 COMMAND = np.array([1.0, -1.0, -1.0], np.float32)  # m/s ahead, m/s to the left, rad/s to the left
 
 
 class Joints(NamedTuple):
-    """Which joint each one becomes, and with which sign."""
+    """The mirrored partner and sign of each joint."""
 
     partner: Int[np.ndarray, " M"]
     sign: Float[np.ndarray, " M"]
 
-    def flipped(self, values: Float[Array, "*n J"]) -> Float[Array, "*n J"]:
-        """Return angles, rates or actions of the first J joints, mirrored."""
+    def flip(self, values: Float[Array, "*n J"]) -> Float[Array, "*n J"]:
+        """Mirror angles, rates or actions of the first J joints."""
         first = values.shape[-1]
         return values[..., self.partner[:first]] * self.sign[:first]
 
 
-def joints(model: mujoco.MjModel) -> Joints:
-    """Read the partner of each hinge off its name, and the sign off both axes.
+def pair_joints(model: mujoco.MjModel) -> Joints:
+    """Pair each hinge with its partner by name, and derive the sign from both axes.
 
     Raises:
-        ValueError: a joint has no partner, or one that does not turn about the mirrored axis.
+        ValueError: a joint has no partner, or the partner's axis is not the mirrored one.
     """
     names = [model.joint(j).name for j in range(1, model.njnt)]  # joint 0 is the pelvis's freejoint
     swapped = [_other_side(name) for name in names]
@@ -54,46 +54,46 @@ def joints(model: mujoco.MjModel) -> Joints:
     return Joints(partner, np.sign(sign).astype(np.float32))
 
 
-def of(model: mujoco.MjModel, c: config.Network) -> Mirror:
-    """Return the mirror of this robot for the actor of this network."""
-    legs = joints(model)
-    turned = functools.partial(frame, c=c)
+def make_mirror(model: mujoco.MjModel, c: config.Network) -> Mirror:
+    """Build the reflections of this robot's observations and actions for this network."""
+    joints = pair_joints(model)
+    flip_frame = functools.partial(frame, c=c)
     return Mirror(
-        obs=lambda seen: proprioception(seen, legs),
-        frames=turned,
-        sight=lambda sight: sight and sight.replace(frames=turned(sight.frames)),
-        action=legs.flipped,
+        obs=lambda obs: proprioception(obs, joints),
+        frames=flip_frame,
+        sight=lambda sight: sight and sight.replace(frames=flip_frame(sight.frames)),
+        action=joints.flip,
     )
 
 
 def body(state: Body, of: Joints) -> Body:
-    """Return the mirror image of a state."""
+    """Mirror a state."""
     q, v, w = state.qpos, state.qvel, state.warmstart
-    speeds = lambda x: jnp.concatenate([POLAR * x[:3], AXIAL * x[3:6], of.flipped(x[6:])])
-    place = jnp.concatenate([POLAR * q[:3], ROTATION * q[3:7], of.flipped(q[7:])])
+    speeds = lambda x: jnp.concatenate([POLAR * x[:3], AXIAL * x[3:6], of.flip(x[6:])])
+    place = jnp.concatenate([POLAR * q[:3], ROTATION * q[3:7], of.flip(q[7:])])
     return Body(place, speeds(v), speeds(w))
 
 
-def proprioception(seen: Float[Array, "*n O"], of: Joints) -> Float[Array, "*n O"]:
-    """Return M o^p: what the robot's mirror image senses."""
-    where = observations.slices(observations.num_joints_of(seen.shape[-1]))
+def proprioception(obs: Float[Array, "*n O"], of: Joints) -> Float[Array, "*n O"]:
+    """Compute M o^p, the mirrored proprioception."""
+    where = observations.slices(observations.num_joints_of(obs.shape[-1]))
     signs = {"angular_velocity": AXIAL, "gravity": POLAR, "command": COMMAND}
     parts = [
-        signs[name] * seen[..., part] if name in signs else of.flipped(seen[..., part])
+        signs[name] * obs[..., part] if name in signs else of.flip(obs[..., part])
         for name, part in where.items()
     ]
     return jnp.concatenate(parts, axis=-1)
 
 
 def frame(
-    seen: Float16[Array, "*n rows columns pixels"], c: config.Network
+    frames: Float16[Array, "*n rows columns pixels"], c: config.Network
 ) -> Float16[Array, "*n rows columns pixels"]:
-    """Return what the mirror image's camera sees, in the order in which the network reads it."""
-    return network.in_patches(c, jnp.flip(network.as_image(c, seen), axis=-1))
+    """Mirror depth frames, keeping the network's patch order."""
+    return network.image_to_patches(c, jnp.flip(network.patches_to_image(c, frames), axis=-1))
 
 
 def scan(heights: Float[Array, "*n M"], c: config.Scan) -> Float[Array, "*n M"]:
-    """Return the critic's heights m_t around the mirror image."""
+    """Mirror the critic's heights m_t around the robot."""
     grid = heights.reshape(*heights.shape[:-1], c.x[2], c.y[2])
     return jnp.flip(grid, axis=-1).reshape(heights.shape)
 

@@ -1,4 +1,4 @@
-"""What a run says while it works: live on a terminal, plain lines elsewhere, always files."""
+"""Progress of a run: a live display on a terminal, plain lines elsewhere, and log files."""
 
 import json
 import time
@@ -13,13 +13,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from tensorboardX import SummaryWriter
 
-PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
+PLAIN_SECONDS = 20.0  # between two lines without a terminal
 SHOWN = {  # name in the log: name on the screen and unit
     "walk/speed_error": ("speed error", "m/s"),
     "walk/forward_speed": ("forward speed", "m/s"),
     "episode/length_s": ("episode length", "s"),
-    "episode/falls_per_minute": ("falls", "a minute"),
-    "walk/reward": ("reward", "a step"),
+    "episode/falls_per_minute": ("falls", "per minute"),
+    "walk/reward": ("reward", "per step"),
     "train/action_std": ("action deviation", ""),
     "loss/kl": ("KL", "nats"),
     "train/learning_rate": ("learning rate", ""),
@@ -27,12 +27,12 @@ SHOWN = {  # name in the log: name on the screen and unit
 
 
 class Reporter:
-    """Writes every iteration to `log.jsonl` and TensorBoard, and shows the newest figures."""
+    """Writes every iteration to `log.jsonl` and TensorBoard, and shows the latest figures."""
 
     def __init__(
         self, run: Path, first: int, last: int, samples: int, tensorboard: bool = True
     ) -> None:
-        """Report iterations `first` to `last` of `samples` samples each."""
+        """Report iterations `first` to `last`, of `samples` samples each."""
         self.console = Console()
         self._file = (run / "log.jsonl").open("a", encoding="utf-8")
         self._board = SummaryWriter(str(run / "tensorboard")) if tensorboard else None
@@ -49,7 +49,7 @@ class Reporter:
             auto_refresh=False,
         )
         self._task = self._bar.add_task("train", total=last, completed=first, rate="")
-        self._said = 0.0
+        self._printed_at = 0.0
 
     def __enter__(self) -> "Reporter":
         if self.console.is_terminal:
@@ -74,12 +74,12 @@ class Reporter:
         self.console.print(line, highlight=False, soft_wrap=True)
 
     def chunk(self, first: int, log: Mapping[str, np.ndarray], seconds: float) -> None:
-        """Report the iterations `first` + 1, ..., that took `seconds` together."""
+        """Report the iterations from `first` + 1 on, which took `seconds` in total."""
         count = len(next(iter(log.values())))
         rate = count * self._samples / seconds
         for i in range(count):
             row = {name: float(values[i]) for name, values in log.items()}
-            line = {"iteration": first + i + 1, "samples_per_s": round(rate), **_rounded(row)}
+            line = {"iteration": first + i + 1, "samples_per_s": round(rate), **_round_row(row)}
             self._file.write(json.dumps(line) + "\n")
             if self._board:
                 for name, value in row.items():
@@ -90,9 +90,9 @@ class Reporter:
     def _show(self, iteration: int, newest: Mapping[str, float], rate: float) -> None:
         self._bar.update(self._task, completed=iteration, rate=f"{rate:,.0f} samples/s")
         if self._live:
-            self._live.update(Group(self._bar, _table(newest)))
-        elif time.monotonic() - self._said > PLAIN_SECONDS or iteration >= self._last:
-            self._said = time.monotonic()
+            self._live.update(Group(self._bar, _build_table(newest)))
+        elif time.monotonic() - self._printed_at > PLAIN_SECONDS or iteration >= self._last:
+            self._printed_at = time.monotonic()
             task = self._bar.tasks[0]
             left = f", {task.time_remaining / 60:.0f} min left" if task.time_remaining else ""
             figures = ", ".join(
@@ -103,8 +103,8 @@ class Reporter:
             self.say(f"{iteration}/{self._last}: {rate:,.0f} samples/s{left}; {figures}")
 
 
-def _table(newest: Mapping[str, float]) -> Table:
-    """Return the figures that are shown, and level and falls by kind of terrain."""
+def _build_table(newest: Mapping[str, float]) -> Table:
+    """Build the table of figures, and of level and falls by kind of terrain."""
     table = Table.grid(padding=(0, 2))
     for name, (title, unit) in SHOWN.items():
         if name in newest:
@@ -116,6 +116,6 @@ def _table(newest: Mapping[str, float]) -> Table:
     return table
 
 
-def _rounded(row: Mapping[str, float]) -> dict[str, float | None]:
-    """Return the row with six digits, and None for what is not finite, which JSON cannot hold."""
+def _round_row(row: Mapping[str, float]) -> dict[str, float | None]:
+    """Round to six digits; None for non-finite numbers, which JSON cannot hold."""
     return {k: float(f"{v:.6g}") if np.isfinite(v) else None for k, v in row.items()}

@@ -1,4 +1,4 @@
-"""The leaves of a state by their paths, and the digests that tell one state from another."""
+"""Leaves of a state by path, and digests that identify a state."""
 
 import hashlib
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import PyTree
 
 
 def digest(tree: PyTree) -> str:
-    """Return one SHA-256 over every path, shape, dtype and bit of `tree`: a policy's name tag."""
+    """Compute one SHA-256 over all paths, shapes, dtypes and bits of `tree`, to identify it."""
     total = hashlib.sha256()
     for path, array in sorted(on_host(tree).items()):
         total.update(f"{path} {bits_digest(array)}\n".encode())
@@ -18,37 +18,37 @@ def digest(tree: PyTree) -> str:
 
 
 def by_path(tree: PyTree, name: str = "") -> dict[str, Any]:
-    """Return the leaves by path, such as params/actor/kernel, under `name` if given.
+    """Map paths, such as params/actor/kernel, to leaves; paths start with `name` if given.
 
     Raises:
         TypeError: a leaf is not an array.
         ValueError: two leaves have one path.
     """
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
-    found = {_path(keys, name): leaf for keys, leaf in flat}
-    if len(found) < len(flat):
+    leaves = {_path(keys, name): leaf for keys, leaf in flat}
+    if len(leaves) < len(flat):
         raise ValueError("two leaves of the state have the same path")
-    for path, leaf in found.items():
+    for path, leaf in leaves.items():
         if not hasattr(leaf, "dtype"):
             raise TypeError(f"{path} is a {type(leaf).__name__}, not an array")
-    return found
+    return leaves
 
 
 def fill_from(like: PyTree, arrays: dict[str, Any], name: str = "") -> PyTree:
-    """Return `like` with the leaves that `arrays` has, paths as in `by_path`."""
+    """Replace the leaves of `like` that `arrays` contains, by paths as in `by_path`."""
     return jax.tree_util.tree_map_with_path(
         lambda keys, leaf: arrays.get(_path(keys, name), leaf), like
     )
 
 
 def on_host(tree: PyTree) -> dict[str, np.ndarray]:
-    """Return the leaves by path as numpy arrays, random keys as their bits."""
+    """Copy the leaves, by path, to numpy arrays; random keys as their bits."""
     host = jax.device_get({path: _bits(leaf) for path, leaf in by_path(tree).items()})
     return {path: np.asarray(leaf) for path, leaf in host.items()}
 
 
 def put_like(array: np.ndarray, like: Any, impl: str) -> Any:
-    """Return `array` as the kind of leaf that `like` is, on its devices.
+    """Convert `array` to the type of leaf that `like` is, on the same devices.
 
     `impl` names the generator if the leaf is a random key, and is empty otherwise.
     """
@@ -59,14 +59,14 @@ def put_like(array: np.ndarray, like: Any, impl: str) -> Any:
     return jax.device_put(typed, like.sharding if getattr(like, "committed", False) else None)
 
 
-def empty(like: Any) -> np.ndarray:
-    """Return what `on_host` would, for a leaf of no elements."""
+def empty_like(like: Any) -> np.ndarray:
+    """Create the array that `on_host` returns for a leaf without elements."""
     bits = jax.eval_shape(_bits, like)
     return np.zeros(bits.shape, bits.dtype)
 
 
 def describe(tree: PyTree, host: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Return shape, dtype, generator and SHA-256 of every leaf; `host` is what `on_host` gave."""
+    """Compute shape, dtype, generator and SHA-256 of every leaf; `host` is `on_host(tree)`."""
     return {
         path: {
             "shape": list(leaf.shape),
@@ -79,7 +79,7 @@ def describe(tree: PyTree, host: dict[str, np.ndarray]) -> dict[str, dict[str, A
 
 
 def bits_digest(array: np.ndarray) -> str:
-    """Return the SHA-256 of dtype, shape and bits."""
+    """Compute the SHA-256 of dtype, shape and bits."""
     total = hashlib.sha256(f"{array.dtype}{array.shape}".encode())
     total.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return total.hexdigest()

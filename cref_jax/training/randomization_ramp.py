@@ -1,7 +1,7 @@
 """Randomisation that grows with competence: one share of all its ranges, for all robots.
 
-A policy that falls at once under all of it learns nothing from it, and one that hardly falls has
-nothing left to learn from less.
+A policy that falls at once under the full ranges learns nothing from them, and one that hardly
+falls has nothing left to learn from smaller ones.
 """
 
 from typing import no_type_check
@@ -12,26 +12,26 @@ from jaxtyping import Array, Float
 
 from cref_jax import config
 
-_MEMORY = 0.9  # of the falls of before, in each iteration; assumed
+_MEMORY = 0.9  # weight of earlier falls in the running mean, per iteration; assumed
 
 
-@no_type_check  # vmap and tree.map fill it with batches, and with what is no array
+@no_type_check  # vmap and tree.map fill it with batches and with non-arrays
 @flax.struct.dataclass
 class Ramp:
-    """How much is randomised, and what that is decided by."""
+    """The share of the randomisation ranges in use, and the fall rate that controls it."""
 
     share: Float[Array, ""]  # of the ranges in the configuration, 0 to 1
-    falls: Float[Array, ""]  # per minute and robot, over the last iterations
+    falls: Float[Array, ""]  # per minute and robot, running mean over iterations
 
 
 def initial_ramp(c: config.Randomisation) -> Ramp:
-    """Begin with nothing randomised, or with everything where there is no ramp."""
+    """Create the initial ramp: no randomisation, or all of it if the ramp is disabled."""
     low, high = c.ramp_falls
     return Ramp(jnp.float32(0.0 if c.ramp else 1.0), jnp.float32(0.5 * (low + high)))
 
 
 def update_ramp(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:
-    """Raise the share after few falls per minute, lower it after many, and keep it in between."""
+    """Raise the share if falls per minute are few, lower it if many, else keep it."""
     if not c.ramp:
         return ramp
     mean = _MEMORY * ramp.falls + (1.0 - _MEMORY) * falls

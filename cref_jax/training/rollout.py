@@ -1,7 +1,7 @@
-"""T steps of E robots under a policy: the one place where the environment meets the learner.
+"""T steps of E robots under a policy: the one place where environment and learner meet.
 
 Training and evaluation share it. The robots' axis is E, and every record is [T, E, ...]. All
-cameras run on one clock: a clock of its own for each robot would render every image at 50 Hz.
+cameras run on one clock: with one clock per robot, every image would be rendered at 50 Hz.
 """
 
 from typing import NamedTuple, no_type_check
@@ -25,17 +25,17 @@ from cref_jax.training.camera_feed import CameraFeed
 
 
 class Memory(NamedTuple):
-    """What the policy holds between two control steps."""
+    """The policy's memory between two control steps."""
 
     carry: network.Carry
-    features: network.Features | None  # of the frame at hand, [1, E, ...]; None for a blind policy
-    twin: "Memory | None" = None  # of the same policy in the mirror, where it is taught symmetry
+    features: network.Features | None  # of the current frame, [1, E, ...]; None for a blind policy
+    twin: "Memory | None" = None  # of the mirrored policy, if symmetry is taught
 
 
 @no_type_check
 @flax.struct.dataclass
 class Robots:
-    """E robots between two control steps, with what their policy remembers."""
+    """E robots between two control steps, with their policy's memory."""
 
     env: EnvState
     observation: Observation
@@ -45,11 +45,11 @@ class Robots:
 
 
 class Networks(NamedTuple):
-    """The modules that are trained."""
+    """The trained modules."""
 
     actor: network.Actor
     critic: network.Critic
-    mirror: ppo.Mirror | None = None  # the symmetry that the actor is taught, if any
+    mirror: ppo.Mirror | None = None  # symmetry taught to the actor, if any
 
     @property
     def functions(self) -> ppo.Networks:
@@ -58,20 +58,20 @@ class Networks(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What a horizon is made of, one control step of it."""
+    """One control step of a horizon."""
 
-    observation: Observation  # that the action was taken on
+    observation: Observation  # before the action
     begins: Bool[Array, " E"]
     action: Float[Array, "E J"]
     mean: Float[Array, "E J"]
     log_std: Float[Array, "E J"]
     outcome: Outcome
-    held: Int[Array, ""]  # the frame at hand, in the album
-    seen: Bool[Array, " E"] | None  # None for a blind policy
+    frame_index: Int[Array, ""]  # of the current frame, in `_Collection.frames`
+    frame_valid: Bool[Array, " E"] | None  # None for a blind policy
 
 
 class Trace(NamedTuple):
-    """What happened at each step, apart from what the update needs."""
+    """Per-step results that the update does not need."""
 
     reward: Float[Array, "T E"]
     ending: Ending
@@ -79,7 +79,7 @@ class Trace(NamedTuple):
 
 
 def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Robots:
-    """Return which axis of each array is that of the robots, named `axis`; clocks have none."""
+    """Return the partition spec of each array over the robots' `axis`; clocks are replicated."""
     sees, robots = variant != "blind", P(axis)
     memory = Memory(robots, P(None, axis) if sees else None)
     return Robots(
@@ -92,34 +92,34 @@ def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Rob
 
 
 def networks(c: config.Network, num_actions: int) -> Networks:
-    """Return the actor and the critic."""
+    """Build the actor and the critic."""
     return Networks(network.Actor(c, num_actions), network.Critic(c))
 
 
 def initial_params(
     c: config.Config, num_actions: int, robots: Robots, key: PRNGKeyArray
 ) -> ppo.Params:
-    """Return fresh parameters for observations of the robots' shapes."""
+    """Initialise parameters for observations of the robots' shapes."""
     key_actor, key_critic = jax.random.split(key)
     one = lambda x: x[None, :1]
-    seen, begins = robots.observation, one(robots.begins)
+    observation, begins = robots.observation, one(robots.begins)
     carry, nets = network.initial_carry(c.network, 1), networks(c.network, num_actions)
-    sight = robots.feed and network.Sight(
+    sight = robots.feed and network.DepthInput(
         one(robots.feed.frame), jnp.zeros_like(begins, jnp.int32), begins
     )
-    (_, said), actor = nets.actor.init_with_output(
-        key_actor, carry, one(seen.proprioception), begins, sight
+    (_, output), actor = nets.actor.init_with_output(
+        key_actor, carry, one(observation.proprioception), begins, sight
     )
-    shape = said.feature.shape[-1], c.scan.x[2] * c.scan.y[2]
+    shape = output.feature.shape[-1], c.scan.x[2] * c.scan.y[2]
     return ppo.Params(
         actor=actor,
-        critic=nets.critic.init(key_critic, one(seen.privileged)),
+        critic=nets.critic.init(key_critic, one(observation.privileged)),
         readout=auxiliary.initial_readout(*shape) if c.ppo.readout_weight else None,
     )
 
 
 def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
-    """Put E robots on their lanes: kinds in turn, low levels at random, episodes out of step."""
+    """Place E robots on lanes: kinds in turn, random low levels, episodes at random times."""
     c = world.config
     key_level, key_reset, key_see, key_step = jax.random.split(key, 4)
     kinds = jnp.asarray(world.lanes.kind_of(np.arange(num_envs)))
@@ -133,16 +133,16 @@ def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
 
 
 def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
-    """Return the robots in these states, with nothing seen or remembered; a key for each."""
+    """Wrap environment states as robots with empty memory and cameras; `keys`: one per robot."""
     c, num_envs = world.config, state.kind.shape[0]
-    seen = jax.vmap(environment.observe, in_axes=(None, 0, 0))(world, state, keys)
+    observation = jax.vmap(environment.observe, in_axes=(None, 0, 0))(world, state, keys)
     sees = c.network.variant != "blind"
     return Robots(
         env=state,
-        observation=seen,
+        observation=observation,
         memory=Memory(
             network.initial_carry(c.network, num_envs),
-            network.no_features(c.network, c.camera.shape, num_envs) if sees else None,
+            network.zero_features(c.network, c.camera.shape, num_envs) if sees else None,
         ),
         begins=jnp.ones(num_envs, bool),
         feed=camera_feed.empty_feed(c, num_envs) if sees else None,
@@ -150,13 +150,13 @@ def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots
 
 
 def with_randomization(robots: Robots, share: Float[Array, ""]) -> Robots:
-    """Return the robots with this share of all that is randomised from the next draw on."""
+    """Set the share of the randomisation ranges that later draws use."""
     spread = even_spread(jnp.broadcast_to(share, robots.begins.shape))
     return robots.replace(env=robots.env.replace(spread=spread))
 
 
 def with_twins(robots: Robots) -> Robots:
-    """Return the robots with an empty memory of the same policy in the mirror."""
+    """Add an empty memory of the mirrored policy."""
     blank = jax.tree.map(jnp.zeros_like, robots.memory)
     return robots.replace(memory=robots.memory._replace(twin=blank))
 
@@ -164,17 +164,17 @@ def with_twins(robots: Robots) -> Robots:
 def policy_step(
     nets: Networks, train: ppo.TrainState, robots: Robots
 ) -> tuple[Memory, network.Output]:
-    """Return the policy's memory after this step and its outputs, [1, E, ...].
+    """Apply the policy; return its memory after this step and its outputs, [1, E, ...].
 
-    A frame is encoded when it comes, and its features are held until the next one. Where the policy
-    is taught symmetry, its twin senses and sees the same in the mirror, and remembers that.
+    A frame is encoded when it arrives, and its features are held until the next one. If symmetry is
+    taught, the mirrored policy gets the mirrored inputs and keeps its own memory.
     """
-    seen, feed, memory = robots.observation.proprioception, robots.feed, robots.memory
-    after, output = _apply_actor(nets, train, robots.begins, seen, feed, memory)
+    obs, feed, memory = robots.observation.proprioception, robots.feed, robots.memory
+    after, output = _apply_actor(nets, train, robots.begins, obs, feed, memory)
     if nets.mirror is not None and memory.twin is not None:
         reflected = feed and feed.replace(frame=nets.mirror.frames(feed.frame))
         twin, _ = _apply_actor(
-            nets, train, robots.begins, nets.mirror.obs(seen), reflected, memory.twin
+            nets, train, robots.begins, nets.mirror.obs(obs), reflected, memory.twin
         )
         after = after._replace(twin=twin)
     return after, output
@@ -188,14 +188,16 @@ def _apply_actor(
     feed: CameraFeed | None,
     memory: Memory,
 ) -> tuple[Memory, network.Output]:
-    """Do what `act` does for one memory."""
+    """Apply the actor with one memory, encoding a frame if it is fresh."""
     params, features = train.params.actor, memory.features
-    obs = ppo.normalise(train.statistics.obs, proprioception)
+    obs = ppo.normalize(train.statistics.obs, proprioception)
     view = None
     if feed is not None:
         encode = lambda: nets.actor.apply(params, feed.frame[None], method="encode")
         features = jax.lax.cond(feed.fresh, encode, lambda: features)
-        view = network.View(features, jnp.zeros_like(feed.seen[None], jnp.int32), feed.seen[None])
+        view = network.EncodedInput(
+            features, jnp.zeros_like(feed.seen[None], jnp.int32), feed.seen[None]
+        )
     carry, output = nets.actor.apply(
         params, memory.carry, obs[None], begins[None], view, method="decide"
     )
@@ -205,51 +207,71 @@ def _apply_actor(
 def env_step(
     world: World, robots: Robots, memory: Memory, action: Float[Array, "E J"]
 ) -> tuple[Robots, Outcome]:
-    """Step every robot with its action, and its camera."""
+    """Step every robot with its action, and the cameras."""
     state, outcome = environment.step_all(world, robots.env, action)
     over = outcome.ending.terminated | outcome.ending.truncated
     feed = robots.feed and camera_feed.update_feed(world, robots.feed, robots.env, over)
     return Robots(state, outcome.observation, memory, begins=over, feed=feed), outcome
 
 
+def step_policy(
+    world: World, train: ppo.TrainState, robots: Robots
+) -> tuple[Robots, network.Output, Outcome]:
+    """Step every robot with the policy's mean action, without noise.
+
+    The output, [1, E, ...], belongs to the observation before the step.
+    """
+    nets = networks(world.config.network, world.physics.robot.num_joints)
+    memory, output = policy_step(nets, train, robots)
+    after, outcome = env_step(world, robots, memory, output.mean[0])
+    return after, output, outcome
+
+
 def collect(
     world: World, nets: Networks, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
 ) -> tuple[Robots, ppo.Rollout, Trace]:
-    """Return a horizon of experience, with actions drawn from the policy.
+    """Collect a horizon of experience, with actions sampled from the policy.
 
-    The features of the frame at hand are those of older parameters, so it is encoded anew; after
-    the horizon they are dropped, since they can be had from the frame.
+    The features of the current frame come from older parameters, so it is encoded anew; after the
+    horizon they are cleared, since the frame determines them.
     """
     c = world.config
     first = robots
     if robots.feed is not None:
         robots = robots.replace(feed=robots.feed.replace(fresh=jnp.ones((), bool)))
 
-    def step(watch: _Collection, noise: Float[Array, "E J"]) -> tuple[_Collection, _Step]:
-        robots = watch.robots
+    def step(collection: _Collection, noise: Float[Array, "E J"]) -> tuple[_Collection, _Step]:
+        robots = collection.robots
         memory, policy = policy_step(nets, train, robots)
         mean = policy.mean[0]
         action = mean + jnp.exp(policy.log_std) * noise
         after, outcome = env_step(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
-        seen = robots.feed and robots.feed.seen
+        frame_valid = robots.feed and robots.feed.seen
         done = _Step(
-            robots.observation, robots.begins, action, mean, log_std, outcome, watch.held, seen
+            robots.observation,
+            robots.begins,
+            action,
+            mean,
+            log_std,
+            outcome,
+            collection.frame_index,
+            frame_valid,
         )
-        return _store_frame(watch.replace(robots=after)), done
+        return _store_frame(collection.replace(robots=after)), done
 
     keys = jax.random.split(key, c.ppo.horizon)
     draw = lambda key: jax.random.normal(key, robots.env.action.shape)
-    watch, steps = jax.lax.scan(step, _start_buffer(c, robots), jax.vmap(draw)(keys))
-    after = watch.robots
+    collection, steps = jax.lax.scan(step, _start_buffer(c, robots), jax.vmap(draw)(keys))
+    after = collection.robots
     after = after.replace(memory=_clear_features(after.memory))
-    rollout = _to_rollout(c, nets, train, first.memory, watch.album, steps)
+    rollout = _to_rollout(c, nets, train, first.memory, collection.frames, steps)
     outcome = steps.outcome
     return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
 
 
 def _clear_features(memory: Memory) -> Memory:
-    """Return what is remembered, with blank features of the frame at hand."""
+    """Zero the features of the current frame in a memory."""
     twin = memory.twin and _clear_features(memory.twin)
     return memory._replace(features=jax.tree.map(jnp.zeros_like, memory.features), twin=twin)
 
@@ -257,31 +279,33 @@ def _clear_features(memory: Memory) -> Memory:
 @no_type_check
 @flax.struct.dataclass
 class _Collection:
-    """The robots during a horizon, and the frames that have come so far."""
+    """The robots during a horizon, and the frames so far."""
 
     robots: Robots
-    album: Float16[Array, "K E rows columns pixels"] | None
-    held: Int[Array, ""]  # where the frame at hand is in the album
+    frames: Float16[Array, "K E rows columns pixels"] | None
+    frame_index: Int[Array, ""]  # of the current frame in `frames`
 
 
 def _start_buffer(c: config.Config, robots: Robots) -> _Collection:
-    """Return the start of a horizon: the frame at hand is the album's first."""
-    album = None
+    """Start a horizon, with the current frame first in the buffer."""
+    frames = None
     if robots.feed is not None:
-        count = 1 + depth.most_frames(c.ppo.horizon - 1, c.camera, c.physics.control_period)
-        album = jnp.zeros((count, *robots.feed.frame.shape), robots.feed.frame.dtype)
-        album = album.at[0].set(robots.feed.frame)
-    return _Collection(robots, album, jnp.zeros((), jnp.int32))
+        count = 1 + depth.max_frames(c.ppo.horizon - 1, c.camera, c.physics.control_period)
+        frames = jnp.zeros((count, *robots.feed.frame.shape), robots.feed.frame.dtype)
+        frames = frames.at[0].set(robots.feed.frame)
+    return _Collection(robots, frames, jnp.zeros((), jnp.int32))
 
 
-def _store_frame(watch: _Collection) -> _Collection:
-    """Put a frame that has just come into the album; one after the last step is the next's."""
-    feed, album = watch.robots.feed, watch.album
-    if feed is None or album is None:
-        return watch
-    held = watch.held + feed.fresh.astype(jnp.int32)
-    add = lambda: album.at[held].set(feed.frame, mode="drop")
-    return watch.replace(album=jax.lax.cond(feed.fresh, add, lambda: album), held=held)
+def _store_frame(collection: _Collection) -> _Collection:
+    """Store a fresh frame in the buffer; one after the last step belongs to the next horizon."""
+    feed, frames = collection.robots.feed, collection.frames
+    if feed is None or frames is None:
+        return collection
+    index = collection.frame_index + feed.fresh.astype(jnp.int32)
+    add = lambda: frames.at[index].set(feed.frame, mode="drop")
+    return collection.replace(
+        frames=jax.lax.cond(feed.fresh, add, lambda: frames), frame_index=index
+    )
 
 
 def _to_rollout(
@@ -289,18 +313,18 @@ def _to_rollout(
     nets: Networks,
     train: ppo.TrainState,
     memory: Memory,
-    album: Float16[Array, "K E rows columns pixels"] | None,
+    frames: Float16[Array, "K E rows columns pixels"] | None,
     steps: _Step,
 ) -> ppo.Rollout:
-    """Return a horizon's steps as the update takes them."""
+    """Assemble the rollout that the update takes from a horizon's steps."""
     value = lambda s: nets.critic.apply(
-        train.params.critic, ppo.normalise(train.statistics.critic_obs, s)
+        train.params.critic, ppo.normalize(train.statistics.critic_obs, s)
     )
     outcome, sight = steps.outcome, None
-    if album is not None and steps.seen is not None:
-        held = jnp.broadcast_to(steps.held[:, None], steps.seen.shape)
+    if frames is not None and steps.frame_valid is not None:
+        index = jnp.broadcast_to(steps.frame_index[:, None], steps.frame_valid.shape)
         hold = depth.longest_hold(c.camera, c.physics.control_period)
-        sight = network.Sight(album, held, steps.seen, hold)
+        sight = network.DepthInput(frames, index, steps.frame_valid, hold)
     return ppo.Rollout(
         obs=steps.observation.proprioception,
         critic_obs=steps.observation.privileged,

@@ -1,8 +1,8 @@
-"""What a run leaves on disk, and how a later program opens it again.
+"""The folder of a run: what it stores, and how to open it again.
 
 runs/NAME/config.json     every setting, so that the run can be resumed or evaluated
 runs/NAME/origin.jsonl    versions, device, command line and git state at each start
-runs/NAME/log.jsonl       one line an iteration
+runs/NAME/log.jsonl       one line per iteration
 runs/NAME/tensorboard/    the same for TensorBoard
 runs/NAME/checkpoints/    see checkpoint.py
 """
@@ -29,14 +29,14 @@ ROOT = Path("runs")
 
 
 def write_config(run: Path, c: Config) -> None:
-    """Write every setting of the run."""
+    """Write all settings of the run."""
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
 def write_origin(run: Path, iteration: int = 0) -> None:
-    """Add a line with what this start of the run is made by: versions, device, command, git.
+    """Append a line with the origin of this start: versions, device, command and git state.
 
-    `iteration` is how many are done before it.
+    `iteration` is the number of iterations done before it.
     """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -52,22 +52,22 @@ def write_origin(run: Path, iteration: int = 0) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """Return what this program runs on."""
+    """Describe the devices and cores that this program runs on."""
     kind = jax.devices()[0].device_kind
     return {"device": f"{jax.device_count()} x {kind}", "cores": os.cpu_count()}
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that a result may depend on."""
+    """Read the versions of the packages that a result may depend on."""
     packages = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     return {name: importlib.metadata.version(name) for name in packages}
 
 
 def read_config(run: Path) -> Config:
-    """Return the settings of a run.
+    """Read the settings of a run.
 
     Raises:
-        ConfigError: there is no such run, or its settings are of another version of the program.
+        ConfigError: no such run, or its settings are from another version of the program.
     """
     path = run / "config.json"
     try:
@@ -83,31 +83,31 @@ def read_config(run: Path) -> Config:
 
 
 def newest(root: Path = ROOT) -> Path:
-    """Return the run with the newest checkpoint.
+    """Find the run with the newest checkpoint.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: no run has one.
     """
-    found = [
+    runs = [
         path.parent for path in root.glob("*/checkpoints") if Checkpoints(path).latest() is not None
     ]
-    if not found:
+    if not runs:
         raise ConfigError(f"no trained run in {root}/; train one with: make train TERRAIN=flat")
-    return max(found, key=lambda run: (run / "checkpoints").stat().st_mtime)
+    return max(runs, key=lambda run: (run / "checkpoints").stat().st_mtime)
 
 
 def checkpoints(run: Path, keep: int = 3) -> Checkpoints:
-    """Return the checkpoints of a run."""
+    """Open the checkpoints of a run."""
     return Checkpoints(run / "checkpoints", keep)
 
 
 def _git_state() -> str | None:
-    """Return the commit that the program is of, marked when it has been changed since."""
+    """Read the program's commit, with a "+" if there are uncommitted changes; None without git."""
     try:
         here = Path(__file__).parent
-        ask = lambda *words: subprocess.run(
+        git = lambda *words: subprocess.run(
             ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
         ).stdout.strip()
-        return ask("rev-parse", "HEAD") + ("+" if ask("status", "--porcelain") else "")
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -1,4 +1,4 @@
-"""The training loop: compiled chunks, checkpoints in between, a check of health."""
+"""The training loop: compiled chunks, with checkpoints and health checks in between."""
 
 import time
 from collections.abc import Mapping
@@ -14,41 +14,41 @@ from cref_jax.training import devices, iteration
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter
 
-MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is no accident
+MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is systematic
 
 
 class Programs:
-    """The compiled programs of chunks of iterations."""
+    """The compiled programs of chunks of iterations, by size."""
 
     def __init__(self, world: World, mesh: Mesh, report: Reporter) -> None:
         self._world, self.mesh, self._report = world, mesh, report
-        self._shapes = iteration.shapes(world, mesh)
-        self._of: dict[int, jax.stages.Compiled] = {}
+        self._shapes = iteration.state_shapes(world, mesh)
+        self._compiled: dict[int, jax.stages.Compiled] = {}
 
-    def of(self, size: int) -> jax.stages.Compiled:
-        """Return the program of `size` iterations; the first one is announced and weighed.
+    def get(self, size: int) -> jax.stages.Compiled:
+        """Compile the program of `size` iterations, once; report time and memory of the first.
 
         Raises:
-            ConfigError: it needs more memory than there is.
+            ConfigError: it needs more memory than the device has.
         """
-        if size not in self._of:
-            first = not self._of
+        if size not in self._compiled:
+            first = not self._compiled
             if first:
                 self._report.say(
                     "compiling (half a minute on four cores, seconds from the cache) ..."
                 )
-            begun = time.monotonic()
+            started_at = time.monotonic()
             lowered = iteration.chunk.lower(self._world, self._shapes, self.mesh, size)
-            self._of[size] = lowered.compile()
+            self._compiled[size] = lowered.compile()
             if first:
-                seconds = time.monotonic() - begun
+                seconds = time.monotonic() - started_at
                 robots = self._world.config.run.num_envs
-                needed = devices.check_memory(self._of[size], robots, self.mesh.size)
+                needed = devices.check_memory(self._compiled[size], robots, self.mesh.size)
                 self._report.say(
-                    f"compiled in {seconds:.0f} s; it takes {needed / 2**30:.1f} GiB of memory; "
+                    f"compiled in {seconds:.0f} s; needs {needed / 2**30:.1f} GiB of memory; "
                     "Ctrl-C saves and stops"
                 )
-        return self._of[size]
+        return self._compiled[size]
 
 
 def run_chunks(
@@ -58,7 +58,7 @@ def run_chunks(
     report: Reporter,
     programs: Programs,
 ) -> iteration.RunState:
-    """Train chunk by chunk; save in between, at the end, and when asked to stop."""
+    """Train chunk by chunk; save in between, at the end, and on a request to stop."""
     c = world.config
     done = int(state.train.iteration)
     if done >= c.run.iterations:
@@ -66,37 +66,37 @@ def run_chunks(
         return state
     saved = time.monotonic()
     with interrupts.StopRequest() as stop:
-        while done < c.run.iterations and not stop.asked:
-            program = programs.of(min(c.run.chunk, c.run.iterations - done))
-            begun = time.monotonic()
+        while done < c.run.iterations and not stop.requested:
+            program = programs.get(min(c.run.chunk, c.run.iterations - done))
+            started_at = time.monotonic()
             state, log = program(world, state)
             log = {name: np.asarray(values) for name, values in log.items()}
-            report.chunk(done, log, time.monotonic() - begun)
+            report.chunk(done, log, time.monotonic() - started_at)
             check_health(log, c.run.num_envs * c.ppo.horizon)
             done = int(state.train.iteration)
             if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
                 _save(steps, state, done, programs.mesh)
                 saved = time.monotonic()
         _save(steps, state, done, programs.mesh)
-    if stop.asked:
+    if stop.requested:
         report.say(f"stopped and saved at iteration {done}")
     return state
 
 
 def _save(steps: Checkpoints, state: iteration.RunState, done: int, mesh: Mesh) -> None:
-    steps.save(done, state, sharing(state, mesh))
+    steps.save(done, state, describe_sharding(state, mesh))
 
 
-def sharing(state: iteration.RunState, mesh: Mesh) -> dict[str, int]:
-    """Return how the robots are shared out; each device has the kinds of lane in turn."""
+def describe_sharding(state: iteration.RunState, mesh: Mesh) -> dict[str, int]:
+    """Describe how robots are sharded; each device cycles through the kinds of lane."""
     return {"num_envs": state.robots.begins.shape[0], "shares": mesh.size}
 
 
 def check_health(log: Mapping[str, np.ndarray], samples: int) -> None:
-    """Stop before a broken simulation or update is saved.
+    """Check that simulation and update are sound, before they are saved.
 
     Raises:
-        TrainingError: too many robots blew up, or no gradient was finite.
+        TrainingError: too many simulations were unstable, or no gradient was finite.
     """
     unstable = float(log["episode/unstable"].max()) / samples
     if unstable > MAX_UNSTABLE:

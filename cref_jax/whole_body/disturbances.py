@@ -1,4 +1,4 @@
-"""What may go wrong from the camera to the policy: lost, late, partly blind and wrong frames."""
+"""Camera faults between camera and policy: lost, late, partly blind and inaccurate frames."""
 
 import math
 from typing import NamedTuple
@@ -6,61 +6,62 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-REGIONS = 3  # at a time, at most; assumed
-REGION_FRAMES = (4, 20)  # how long they stay, from, to: 0.2 to 1 s at 20 Hz; assumed
-FARTHEST = 10.0  # m; noise grows up to there, so that what is far or nowhere stays so; assumed
-WOBBLES = 5  # waves around a region's outline, at most; assumed
+REGIONS = 3  # at most at a time; assumed
+REGION_FRAMES = (4, 20)  # range of their lifetime: 0.2 to 1 s at 20 Hz; assumed
+FARTHEST = 10.0  # m; noise grows up to this depth, so that far pixels and misses stay far; assumed
+WOBBLES = 5  # highest wave number of a region's outline; assumed
 
 Frame = Float[np.ndarray, "H W"]  # z-depth, m
 
 
 class Disturbance(NamedTuple):
-    """How bad the way from the camera to the policy is; as it stands, as good as in training."""
+    """Camera faults; the defaults match training."""
 
-    dropped: float = 0.0  # share of frames that are lost, each by itself
-    latency: int = 1  # control steps from a frame's exposure until the policy has it
-    invalid: float = 0.0  # share of the image that reads nothing, as where light is reflected
-    noise: float = 0.0  # m, deviation at 1 m; grows with the distance's square, as stereo's does
-    scale: float = 1.0  # depth read for a depth of 1
-    dead: float = 0.0  # share of columns that read nothing, the same for a whole trial
-    seed: int = 0  # of all that is random here
+    dropped: float = 0.0  # share of frames lost, independently
+    latency: int = 1  # control steps from exposure to delivery
+    invalid: float = 0.0  # share of the image without a reading, as at reflections
+    noise: float = 0.0  # m, standard deviation at 1 m; grows with depth squared, as in stereo
+    scale: float = 1.0  # reading / true depth
+    dead: float = 0.0  # share of dead columns, fixed for a whole trial
+    seed: int = 0  # of all random numbers here
 
 
 UNDISTURBED = Disturbance()
 
 
 class Channel:
-    """The way of a trial's frames from the camera to the policy."""
+    """The channel of a trial's frames from the camera to the policy."""
 
     def __init__(self, disturbance: Disturbance) -> None:
         self._d = disturbance
+        # separate generators, so that one fault does not change the others
         self._losses, self._holes, self._errors = (
             np.random.default_rng([disturbance.seed, k]) for k in range(3)
-        )  # apart, so that one does not change the other
+        )
         self._dead: Bool[np.ndarray, " W"] | None = None
-        self._way: list[tuple[int, Frame, float]] = []  # due at a step, frame, exposed at a time
+        self._queue: list[tuple[int, Frame, float]] = []  # due step, frame, time of exposure
         self._blind: Frame = np.zeros((0, 0))
-        self._left = 0  # frames until other regions go blind
+        self._left = 0  # frames until new regions go blind
 
     def loses_one(self) -> bool:
-        """Return whether the frame that is to be exposed now is lost; to be asked once a frame."""
+        """Decide at random whether the next frame is lost; call once per frame."""
         return bool(self._losses.random() < self._d.dropped)
 
     def send(self, frame: Frame, step: int, stamp: float) -> None:
-        """Send a frame that was exposed at this control step and time, s."""
+        """Send a frame exposed at this control step and time, s."""
         frame = self._misread(frame)
         if self._d.invalid > 0.0:
             frame = np.where(self._mask(frame.shape), self._blind, frame)
-        self._way.append((step + self._d.latency, frame, stamp))
+        self._queue.append((step + self._d.latency, frame, stamp))
 
     def receive(self, step: int) -> tuple[Frame, float] | None:
-        """Return the frame that has come at this control step, and when it was exposed."""
-        if self._way and self._way[0][0] <= step:
-            return self._way.pop(0)[1:]
+        """Receive the frame due at this control step with its time of exposure, or None."""
+        if self._queue and self._queue[0][0] <= step:
+            return self._queue.pop(0)[1:]
         return None
 
     def _misread(self, frame: Frame) -> Frame:
-        """Return the frame as a camera reads it that errs; undisturbed it is the same one."""
+        """Apply scale error, noise and dead columns; without them, return the frame itself."""
         d = self._d
         if d.scale != 1.0:
             frame = (d.scale * frame).astype(np.float32)
@@ -77,7 +78,7 @@ class Channel:
         return frame
 
     def _mask(self, shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-        """Return what is blind in this frame; some of it reads 0 and some NaN."""
+        """Compute the mask of blind pixels in this frame; a region reads 0 or NaN."""
         if self._left == 0:
             rng = self._holes
             self._left = int(rng.integers(*REGION_FRAMES, endpoint=True))
@@ -92,11 +93,11 @@ class Channel:
 def regions(
     shape: tuple[int, int], share: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return for each pixel which of `count` regions it is in, or -1, i64[H, W].
+    """Sample `count` random regions; return the region of each pixel or -1, i64[H, W].
 
-    Together they cover `share` of the image, to the pixel. A region reaches from its middle to
-    k r(angle) in each direction, where r is a wobbly outline, so it is in one piece; k is the same
-    for all, and such that the share comes out. Where two overlap, a pixel is in the nearer one.
+    Together they cover `share` of the image, to the pixel. A region extends from its centre to
+    k r(angle) in each direction, where r is a wavy outline, so it is connected; k is the same for
+    all and chosen to match the share. Where two overlap, a pixel belongs to the nearer one.
     """
     rows, columns = shape
     y, x = np.mgrid[:rows, :columns] + 0.5

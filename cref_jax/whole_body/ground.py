@@ -1,4 +1,4 @@
-"""What the whole robot walks on: lanes of boxes, or any scene of solids."""
+"""Ground of the whole robot: lanes of boxes, or any scene of solids."""
 
 import math
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -11,35 +11,35 @@ from cref_jax import geoms
 from cref_jax.errors import ConfigError
 
 MOST_BOXES = 20_000
-MARGIN = 4.0  # m around the lane where its border goes on, as in training; further than is seen
-GROUND, SEEN, UNSEEN = 0, 1, 2  # geom groups; rays meet the first two
+MARGIN = 4.0  # m by which the lane's border is extended, as in training; beyond the camera's range
+GROUND, SEEN, UNSEEN = 0, 1, 2  # geom groups; rays hit the first two
 
 
 @runtime_checkable
 class Ground(Protocol):
-    """What a trial is walked on.
+    """The ground of a trial.
 
-    The ground always meets soles and shanks, and the links that are kept clear. Where
-    `stops_every_link`, it meets arms, knees and the capsules of the feet as well: a hand is stopped
-    by a rail, which is no fall, and a foot stands across slots that its spheres would sink into.
-    Pelvis, torso, head and thighs end the trial wherever they touch. On a lane there is nothing
-    beside the robot, and contact is as in training, by spheres alone. On level ground the two are
-    the same: spheres and capsules of a foot end at one height.
+    The ground always collides with soles and shanks, and with the links that are kept clear. If
+    `stops_every_link`, it also collides with arms, knees and the capsules of the feet: a rail stops
+    a hand, which is not a fall, and a foot can stand across slots that its spheres would sink into.
+    Contact of pelvis, torso, head or thighs ends the trial. On a lane nothing stands beside the
+    robot, and contact is as in training, by spheres alone. On level ground both are the same:
+    spheres and capsules of a foot end at the same height.
     """
 
     @property
     def end(self) -> float:
-        """Return where along x a trial is won, m; infinite on open ground."""
+        """The x at which a trial is won, m; infinite on open ground."""
         ...
 
     @property
     def width(self) -> float:
-        """Return how wide the path is, m; it lies on both sides of y = 0."""
+        """The width of the path, m, centred on y = 0."""
         ...
 
     @property
     def stops_every_link(self) -> bool:
-        """Return whether all links of the robot are solid to it."""
+        """Whether it collides with all links of the robot."""
         ...
 
     def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
@@ -53,7 +53,7 @@ class Lane(NamedTuple):
     heights: Float[np.ndarray, "X Y"]  # m, of the columns
     origin: Float[np.ndarray, "2"]  # m, outer corner of the first column
     cell: float  # m
-    end: float  # m along x where a trial is won; infinite on open ground
+    end: float  # m along x at which a trial is won; infinite on open ground
     width: float = math.inf  # m
     stops_every_link: bool = False
 
@@ -61,16 +61,16 @@ class Lane(NamedTuple):
         """Add boxes, and a border around them.
 
         Raises:
-            ConfigError: they are too many.
+            ConfigError: there are too many boxes.
         """
         around = math.ceil(MARGIN / self.cell)
         heights = np.pad(self.heights, around, mode="edge")
         origin = self.origin - around * self.cell
-        found = geoms.boxes(heights, max(heights.shape), MOST_BOXES)
-        if found is None:
+        boxes = geoms.merge_boxes(heights, max(heights.shape), MOST_BOXES)
+        if boxes is None:
             raise ConfigError(f"this ground needs more than {MOST_BOXES} boxes")
         bottom = float(self.heights.min()) - 0.1  # m
-        for first, size, height in zip(found.first, found.size, found.height, strict=True):
+        for first, size, height in zip(boxes.first, boxes.size, boxes.height, strict=True):
             half = 0.5 * (height - bottom)
             spec.worldbody.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX,

@@ -1,10 +1,10 @@
-"""Scenes that no policy was trained on: real solids, read from `terrains/ood/*.toml`.
+"""Scenes of solids that no policy was trained on, read from `terrains/ood/*.toml`.
 
-The paper judges policies in twenty MuJoCo scenes with "perforated or hollow foothold surfaces" and
-"lateral heterogeneous structures" (Sec. III-A), and shows pictures of some. These twenty are ours.
+The paper evaluates policies in twenty MuJoCo scenes with "perforated or hollow foothold surfaces"
+and "lateral heterogeneous structures" (Sec. III-A) and shows some of them. These twenty are ours.
 
 A scene is a level floor at z = 0, cut by ditches, with boxes and cylinders on it. Robots start on
-bare floor and walk along +x; whoever comes to x = `end` within the scene's width has passed it.
+bare floor and walk along +x; a robot that reaches x = `end` within the scene's width passes.
 """
 
 import dataclasses
@@ -22,10 +22,10 @@ from cref_jax import config, geoms
 from cref_jax.config import folders
 from cref_jax.errors import ConfigError
 
-BORDER = 4.0  # m of floor around the path; assumed: further than the camera sees
+BORDER = 4.0  # m of floor around the path; assumed: beyond the camera's range
 DITCH = 1.0  # m, depth of a ditch; as deep as the trained gaps
-MOST_SOLIDS = 3000  # of a scene; assumed: a frame's rays still take milliseconds
-FLOOR = "floor"  # name of its material
+MOST_SOLIDS = 3000  # per scene; assumed: ray-casting a frame still takes milliseconds
+FLOOR = "floor"  # name of the floor's material
 
 R = TypeVar("R")
 Range = tuple[float, float]  # m, from, to
@@ -44,7 +44,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {  # red, green, blue
 
 
 class Solid(NamedTuple):
-    """A box or a cylinder that stands still."""
+    """A static box or cylinder."""
 
     kind: Literal["box", "cylinder"]
     middle: Float[np.ndarray, "3"]  # m
@@ -58,39 +58,39 @@ class Scene(NamedTuple):
 
     name: str
     title: str
-    end: float  # m along x where it is passed
-    width: float  # m, of the path; who leaves it has strayed
-    ditches: tuple[Range, ...]  # m along x, rising
+    end: float  # m along x at which the scene is passed
+    width: float  # m, of the path; a robot outside has strayed
+    ditches: tuple[Range, ...]  # m along x, ascending
     solids: tuple[Solid, ...]
-    stops_every_link: bool = True  # see stand_in.Ground
+    stops_every_link: bool = True  # see ground.Ground
 
     def add_to(self, spec: mujoco.MjSpec, friction: float) -> None:
-        """Add floor and solids to a model."""
+        """Add the floor and the solids to a model."""
         geoms.add_checker(spec, FLOOR, geoms.TONES, repeat=0.5 / geoms.TILE)
         for part in self._floor():
-            _add(spec, part, friction).material = FLOOR
+            _add_solid(spec, part, friction).material = FLOOR
         for part in self.solids:
-            _add(spec, part, friction).rgba = [*COLOURS[part.look], 1.0]
+            _add_solid(spec, part, friction).rgba = [*COLOURS[part.look], 1.0]
 
     def _floor(self) -> list[Solid]:
-        """Return the floor between the ditches, and theirs."""
+        """Build the floor between the ditches and the floor of each ditch."""
         edges = [-BORDER, *itertools.chain(*self.ditches), self.end + BORDER]
         half = 0.5 * self.width + BORDER
         tops = itertools.cycle([0.0, -DITCH])
         return [
-            _box(_Box((a, b), (-half, half), (-DITCH - 0.1, top)))
+            _build_box(_Box((a, b), (-half, half), (-DITCH - 0.1, top)))
             for (a, b), top in zip(itertools.pairwise(edges), tops, strict=False)
         ]
 
 
 @dataclass(frozen=True)
 class _Box:
-    """A box as a file gives it, and how often: `count` times `by` along each of some ways."""
+    """A box in a file, repeated `count[i]` times at spacing `by[i]` for each i."""
 
     x: Range
     y: Range
     z: Range
-    tilt: Point = (0.0, 0.0, 0.0)  # deg about its middle: about x, then about y, then about z
+    tilt: Point = (0.0, 0.0, 0.0)  # deg about its centre: about x, then y, then z
     look: Look = "concrete"
     count: tuple[int, ...] = ()
     by: tuple[Point, ...] = ()
@@ -98,7 +98,7 @@ class _Box:
 
 @dataclass(frozen=True)
 class _Cylinder:
-    """A cylinder as a file gives it, and how often."""
+    """A cylinder in a file, repeated like a box."""
 
     ends: tuple[Point, Point]
     radius: float  # m
@@ -109,7 +109,7 @@ class _Cylinder:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a part of several solids stands, and how often."""
+    """The position of a part of several solids, repeated like a box."""
 
     part: str
     at: Point
@@ -120,7 +120,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class _File:
-    """A scene's file."""
+    """The contents of a scene file."""
 
     title: str
     end: float
@@ -134,62 +134,63 @@ class _File:
 
 @dataclass(frozen=True)
 class _Part:
-    """Solids that are placed together."""
+    """Solids placed together."""
 
     box: tuple[dict, ...] = ()
     cylinder: tuple[dict, ...] = ()
 
 
 def directory() -> Path:
-    """Return where the scenes are."""
+    """Return the folder of the scene files."""
     return folders.data_folder("terrains") / "ood"
 
 
-def scenes() -> dict[str, Scene]:
-    """Return all scenes by their names, in the order of the names."""
+def load_all() -> dict[str, Scene]:
+    """Load all scenes by name, in the order of the names."""
     return {path.stem: load(path) for path in sorted(directory().glob("*.toml"))}
 
 
-def named(name: str) -> Scene:
-    """Return one scene.
+def load_named(name: str) -> Scene:
+    """Load the scene of this name.
 
     Raises:
-        ConfigError: there is none of this name, or its file cannot be used.
+        ConfigError: there is no such scene, or its file cannot be used.
     """
     known = sorted(path.stem for path in directory().glob("*.toml"))
     if name not in known:
-        raise ConfigError(config.unknown("scene", name, known))
+        raise ConfigError(config.describe_unknown("scene", name, known))
     return load(directory() / f"{name}.toml")
 
 
 def load(path: Path) -> Scene:
-    """Return the scene in a file.
+    """Load the scene in a file.
 
     Raises:
-        ConfigError: the file cannot be used; the message says what would be right.
+        ConfigError: the file cannot be used; the message states what is expected.
     """
     where = path.name
     table = config.load_toml(path)
     _check_finite(table, where)
-    file = _record(_File, table, where)
+    file = _read_record(_File, table, where)
     if not (file.end > 0.0 and file.width > 0.0):
         raise ConfigError(f"{where}: end and width must be above zero")
     edges = [0.0, *itertools.chain(*file.ditches), file.end + BORDER]
     if any(a >= b for a, b in itertools.pairwise(edges)):
-        raise ConfigError(f"{where}: ditches must be [[from, to], ...] along x, rising")
+        raise ConfigError(f"{where}: ditches must be [[from, to], ...] along x, ascending")
     parts = {
-        name: _part(table, f"{where}: part.{name}") for name, table in (file.part or {}).items()
+        name: _read_part(table, f"{where}: part.{name}")
+        for name, table in (file.part or {}).items()
     }
-    solids = _solids(file, where)
+    solids = _read_solids(file, where)
     for number, entry in enumerate(file.place, start=1):
-        solids += _placed(_record(_Place, entry, f"{where}: place {number}"), parts, where)
+        solids += _place_part(_read_record(_Place, entry, f"{where}: place {number}"), parts, where)
     if len(solids) > MOST_SOLIDS:
         raise ConfigError(f"{where}: {len(solids)} solids, more than {MOST_SOLIDS}")
     return Scene(path.stem, file.title, file.end, file.width, file.ditches, tuple(solids))
 
 
-def _add(spec: mujoco.MjSpec, solid: Solid, friction: float) -> mujoco.MjsGeom:
-    """Add a solid to a model, and return its geom."""
+def _add_solid(spec: mujoco.MjSpec, solid: Solid, friction: float) -> mujoco.MjsGeom:
+    """Add a solid to a model and return its geom."""
     is_box = solid.kind == "box"
     return spec.worldbody.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX if is_box else mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -203,43 +204,43 @@ def _add(spec: mujoco.MjSpec, solid: Solid, friction: float) -> mujoco.MjsGeom:
     )
 
 
-def _part(table: Any, where: str) -> list[Solid]:
+def _read_part(table: Any, where: str) -> list[Solid]:
     if not isinstance(table, dict):
         raise ConfigError(f"{where} must be a table of boxes and cylinders")
-    return _solids(_record(_Part, table, where), where)
+    return _read_solids(_read_record(_Part, table, where), where)
 
 
-def _solids(file: _File | _Part, where: str) -> list[Solid]:
-    """Return the boxes and cylinders of a file or of a part, each as often as it says."""
-    found = []
+def _read_solids(file: _File | _Part, where: str) -> list[Solid]:
+    """Read the boxes and cylinders of a file or part, with their repetitions."""
+    solids = []
     for number, table in enumerate(file.box, start=1):
-        box = _record(_Box, table, f"{where}: box {number}")
+        box = _read_record(_Box, table, f"{where}: box {number}")
         for side, (a, b) in {"x": box.x, "y": box.y, "z": box.z}.items():
             if a >= b:
                 raise ConfigError(
-                    f"{where}: box {number}: {side} must be [from, to], rising, not {[a, b]}"
+                    f"{where}: box {number}: {side} must be [from, to], ascending, not {[a, b]}"
                 )
-        found += _repeated(_box(box), box, f"{where}: box {number}")
+        solids += _repeat_solid(_build_box(box), box, f"{where}: box {number}")
     for number, table in enumerate(file.cylinder, start=1):
-        rod = _record(_Cylinder, table, f"{where}: cylinder {number}")
+        rod = _read_record(_Cylinder, table, f"{where}: cylinder {number}")
         if not rod.radius > 0.0:
             raise ConfigError(
                 f"{where}: cylinder {number}: radius must be above zero, not {rod.radius}"
             )
         if rod.ends[0] == rod.ends[1]:
-            raise ConfigError(f"{where}: cylinder {number}: its ends must be apart")
-        found += _repeated(_cylinder(rod), rod, f"{where}: cylinder {number}")
-    return found
+            raise ConfigError(f"{where}: cylinder {number}: its ends must differ")
+        solids += _repeat_solid(_build_cylinder(rod), rod, f"{where}: cylinder {number}")
+    return solids
 
 
-def _box(box: _Box) -> Solid:
+def _build_box(box: _Box) -> Solid:
     low, high = np.array([box.x, box.y, box.z]).T
     rotation = np.zeros(4)
     mujoco.mju_euler2Quat(rotation, np.radians(box.tilt), "XYZ")
     return Solid("box", 0.5 * (low + high), 0.5 * (high - low), rotation, box.look)
 
 
-def _cylinder(rod: _Cylinder) -> Solid:
+def _build_cylinder(rod: _Cylinder) -> Solid:
     first, last = np.array(rod.ends)
     length, rotation = float(np.linalg.norm(last - first)), np.zeros(4)
     mujoco.mju_quatZ2Vec(rotation, (last - first) / length)
@@ -247,34 +248,36 @@ def _cylinder(rod: _Cylinder) -> Solid:
     return Solid("cylinder", 0.5 * (first + last), size, rotation, rod.look)
 
 
-def _placed(place: _Place, parts: dict[str, list[Solid]], where: str) -> list[Solid]:
-    """Return the solids of a part where it stands."""
+def _place_part(place: _Place, parts: dict[str, list[Solid]], where: str) -> list[Solid]:
+    """Place the solids of a part."""
     if place.part not in parts:
-        raise ConfigError(config.unknown("part", place.part, list(parts), f"{where}: "))
-    angle, turn, found = math.radians(place.turn), np.zeros(4), []
+        raise ConfigError(config.describe_unknown("part", place.part, list(parts), f"{where}: "))
+    angle, turn, solids = math.radians(place.turn), np.zeros(4), []
     mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), angle)
     for solid in parts[place.part]:
         middle, rotation = np.zeros(3), np.zeros(4)
         mujoco.mju_rotVecQuat(middle, solid.middle, turn)
         mujoco.mju_mulQuat(rotation, turn, solid.rotation)
         moved = solid._replace(middle=middle + place.at, rotation=rotation)
-        found += _repeated(moved, place, f"{where}: place '{place.part}'")
-    return found
+        solids += _repeat_solid(moved, place, f"{where}: place '{place.part}'")
+    return solids
 
 
-def _repeated(solid: Solid, record: _Box | _Cylinder | _Place, where: str) -> list[Solid]:
-    """Return the solid as often as the record says."""
+def _repeat_solid(solid: Solid, record: _Box | _Cylinder | _Place, where: str) -> list[Solid]:
+    """Repeat a solid along the directions `by` of its record."""
     if len(record.count) != len(record.by) or any(n < 1 for n in record.count):
-        raise ConfigError(f"{where}: count and by must be as many, and each count at least 1")
+        raise ConfigError(
+            f"{where}: count and by must have equal length, and each count be at least 1"
+        )
     if math.prod(record.count) > MOST_SOLIDS:
-        raise ConfigError(f"{where}: count must not ask for more than {MOST_SOLIDS} solids")
+        raise ConfigError(f"{where}: count must not give more than {MOST_SOLIDS} solids")
     steps = itertools.product(*(range(n) for n in record.count))
     by = np.array(record.by).reshape(-1, 3)
     return [solid._replace(middle=solid.middle + np.array(step) @ by) for step in steps]
 
 
-def _record(cls: type[R], table: dict[str, Any], where: str) -> R:
-    """Return a table of a file as the record `cls`; what has no default must be there."""
+def _read_record(cls: type[R], table: dict[str, Any], where: str) -> R:
+    """Read a table as the record `cls`; fields without a default are required."""
     fields = dataclasses.fields(cls)
     missing = [f.name for f in fields if f.name not in table and f.default is dataclasses.MISSING]
     if missing and table.keys() <= {f.name for f in fields}:
@@ -283,7 +286,7 @@ def _record(cls: type[R], table: dict[str, Any], where: str) -> R:
 
 
 def _check_finite(value: Any, where: str) -> None:
-    """Refuse numbers that are none, wherever they stand in a table."""
+    """Refuse NaN and infinity anywhere in a table."""
     if isinstance(value, dict | list):
         for inner in value.values() if isinstance(value, dict) else value:
             _check_finite(inner, where)

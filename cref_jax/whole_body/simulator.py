@@ -1,9 +1,9 @@
-"""The whole robot: all 31 joints in MuJoCo C on real boxes, driven by an exported policy.
+"""The whole robot: all 31 joints in MuJoCo C on solid boxes, driven by an exported policy.
 
-Nothing of the training simulation is in it: the ground is solids and not tangent planes, depth
-comes from MuJoCo's own ray-cast, the upper body is held by its motors, and deploy.py runs the
-policy on what a robot measures. Its rules repeat those of training on purpose, as an independent
-oracle; tests hold each pair together.
+It shares nothing with the training simulation: the ground is solids, not tangent planes; depth
+comes from MuJoCo's own ray-cast; the upper body is held by its motors; and deploy.py runs the
+policy on measured inputs. Its rules duplicate those of training on purpose, as an independent
+oracle; tests compare each pair.
 """
 
 import math
@@ -16,11 +16,11 @@ from cref_jax import config, robot
 from cref_jax.config import Config
 from cref_jax.whole_body.ground import GROUND, SEEN, UNSEEN, Ground
 
-FAR = 1e3  # m, a ray that meets nothing
+FAR = 1e3  # m, length of the rays
 
 
 class WholeBodySim:
-    """The compiled model of robot and ground, and where things are in it."""
+    """The compiled model of robot and ground, with its indices."""
 
     def __init__(
         self,
@@ -33,26 +33,26 @@ class WholeBodySim:
 
         Args:
             c: settings of physics, camera and episodes.
-            ground: what to walk on.
-            joints: those that the policy drives, in its order.
-            friction: coefficient that acts between robot and ground. MuJoCo takes the larger one
-                of two geoms, so that both have it.
+            ground: the ground to walk on.
+            joints: the joints driven by the policy, in its order.
+            friction: coefficient between robot and ground; set on both, since MuJoCo uses the
+                larger one of two geoms.
 
         Raises:
             ConfigError: the ground needs too many boxes.
         """
         self.config, self.ground = c, ground
         self.robot = robot.load(config.Robot(c.robot.name, actuated="all"))
-        self.model = model = _spec(c, ground, self.robot, friction).compile()
+        self.model = model = _build_spec(c, ground, self.robot, friction).compile()
         names = self.robot.joint_names
         self.driven = np.array([names.index(name) for name in joints])
         self.feet = list(self.robot.ankles)
-        self.rays = _rays(c.camera)
+        self.rays = _pixel_rays(c.camera)
         clear = np.array(self.robot.capsules.names)[self.robot.capsules.kept_clear]
         self.kept_clear = {model.geom(name).id for name in clear}
 
     def image(self, state: mujoco.MjData) -> Float[np.ndarray, "H W"]:
-        """Return z-depth in metres by ray-cast, infinity where a ray meets nothing."""
+        """Render z-depth in metres by ray-cast, infinity where a ray hits nothing."""
         mount, camera = self.robot.camera, self.config.camera
         link = state.xmat[mount.body].reshape(3, 3)
         fixed = np.zeros(9)
@@ -63,10 +63,10 @@ class WholeBodySim:
         position = state.xpos[mount.body] + link @ mount.position
         world = self.rays @ (link @ fixed.reshape(3, 3) @ axes).T
         count = len(world)
-        found, distance = np.zeros(count, np.int32), np.zeros(count)
+        geom, distance = np.zeros(count, np.int32), np.zeros(count)
         groups = np.array([g in (GROUND, SEEN) for g in range(6)], np.uint8)
         mujoco.mj_multiRay(
-            self.model, state, position, world.ravel(), groups, True, -1, found, distance,
+            self.model, state, position, world.ravel(), groups, True, -1, geom, distance,
             None, count, FAR,
         )  # fmt: skip
         depth = np.where(distance < 0.0, np.inf, distance * self.rays[:, 2])
@@ -78,7 +78,7 @@ class WholeBodySim:
         for _ in range(substeps):
             mujoco.mj_step(self.model, state)
             force += self.foot_force(state) / substeps
-        mujoco.mj_forward(self.model, state)  # poses and contacts of this moment, not of the last
+        mujoco.mj_forward(self.model, state)  # update poses and contacts to the new state
         return force
 
     def foot_force(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
@@ -86,12 +86,12 @@ class WholeBodySim:
         return -state.sensordata.reshape(2, 3)
 
     def is_hit(self, state: mujoco.MjData) -> bool:
-        """Return whether a part that is kept clear has come down."""
+        """Check whether a geom that is kept clear is in contact."""
         return not self.kept_clear.isdisjoint(state.contact.geom.ravel())
 
 
-def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors through the pixels' middles: right, down, forward."""
+def _pixel_rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
+    """Compute unit vectors through the pixel centres: right, down, forward."""
     rows, columns = camera.shape
     down, right = (math.tan(math.radians(0.5 * angle)) for angle in camera.view)
     at = lambda n, reach: reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
@@ -100,8 +100,8 @@ def _rays(camera: config.Camera) -> Float[np.ndarray, "n 3"]:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def _spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> mujoco.MjSpec:
-    """Return robot and ground; rays meet the ground and the links that training renders."""
+def _build_spec(c: Config, ground: Ground, whole: robot.Robot, friction: float) -> mujoco.MjSpec:
+    """Build robot and ground; rays hit the ground and the links that training renders."""
     spec = robot.spec("all", c.physics, contact_planes=0, visual=True, name=c.robot.name)
     capsules = whole.capsules
     in_view = {n for n, yes in zip(capsules.names, capsules.in_view, strict=True) if yes}

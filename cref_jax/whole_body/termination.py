@@ -1,4 +1,4 @@
-"""How a trial ends: by the rules of training, astray, or stalled."""
+"""Termination of a trial: the rules of training, straying and stalling."""
 
 import collections
 import math
@@ -12,10 +12,10 @@ from cref_jax.whole_body.simulator import WholeBodySim
 
 
 class TerminationChecker:
-    """Says how a trial ends: by the rules of training (env.terminations), astray, or stalled."""
+    """Checks the rules of training (env.terminations), straying and stalling."""
 
     def __init__(self, body: WholeBodySim, state: mujoco.MjData, speed: float = 0.0) -> None:
-        """Begin with the first state; `speed` is the command, m/s."""
+        """Start from the first state; `speed` is the command, m/s."""
         self._body, self._c, self._speed = body, body.config, speed
         self._period = body.config.physics.control_period
         self._x = collections.deque(
@@ -23,8 +23,8 @@ class TerminationChecker:
         )
         self._support = state.qpos[2] - body.config.reward.base_height_target
 
-    def ending(self, state: mujoco.MjData, force: Float[np.ndarray, "2 3"]) -> str | None:
-        """Return the first reason to end, or None; to be asked after every control step."""
+    def check(self, state: mujoco.MjData, force: Float[np.ndarray, "2 3"]) -> str | None:
+        """Find the first reason to end, or None; call after every control step."""
         c, episode, body = self._c, self._c.episode, self._body
         if any(warning.number for warning in state.warning):
             return "unstable"
@@ -47,6 +47,6 @@ class TerminationChecker:
         return next((name for name, is_so in reasons.items() if is_so), None)
 
     def _has_stalled(self, x: float) -> bool:
-        """Return whether the robot has stalled now that it is at x, m."""
+        """Record x, m, and check whether the robot has stalled."""
         self._x.append(x)
         return stall.stalled_at(np.array(self._x), self._speed, self._period) is not None

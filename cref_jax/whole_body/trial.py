@@ -16,21 +16,21 @@ from cref_jax.whole_body.termination import TerminationChecker
 
 
 class Start(NamedTuple):
-    """How a trial begins."""
+    """The initial pose and command of a trial."""
 
     base: Float[np.ndarray, "7"]  # m, quaternion w, x, y, z
-    q: Float[np.ndarray, " J"]  # rad, of the joints that the policy drives
+    q: Float[np.ndarray, " J"]  # rad, of the joints driven by the policy
     speed: float  # m/s forward, commanded
 
 
 class Trial(NamedTuple):
-    """What became of it."""
+    """The outcome of a trial."""
 
     ending: str  # tilted, low, hit, dropped, unstable, strayed, finished, stalled, late
     seconds: float
     progress: float  # m along the lane
     speed: float  # m/s forward in the body frame, mean
-    status: Status  # everything that the policy has ever said was wrong
+    status: Status  # union of the policy's status over all steps and frames
     qpos: Float[np.ndarray, "T Q"]  # before each control step
 
 
@@ -41,35 +41,35 @@ def run_trial(
     seconds: float,
     disturbance: Disturbance = UNDISTURBED,
 ) -> Trial:
-    """Let the policy walk once, until it falls, is through, or has stalled.
+    """Run one trial until the robot falls, finishes, strays or stalls, or time is up.
 
     Args:
         body: the model.
-        policy: as deploy.py loads it; it is reset.
-        start: pose and command.
-        seconds: at most.
-        disturbance: what happens to the frames on their way from the camera.
+        policy: as loaded by deploy.py; it is reset first.
+        start: initial pose and command.
+        seconds: time limit.
+        disturbance: camera faults.
     """
     c, period, latency = body.config, body.config.physics.control_period, disturbance.latency
     state = _initial_state(body, start)
-    judge, channel = TerminationChecker(body, state, start.speed), Channel(disturbance)
+    checker, channel = TerminationChecker(body, state, start.speed), Channel(disturbance)
     ending, status, path, speeds = None, Status.OK, [], []
     policy.reset()
     for t in range(round(seconds / period)):
         path.append(state.qpos.copy())
-        if come := channel.receive(t):
-            status |= policy.on_depth(*come)
-        turned = state.xmat[body.robot.pelvis].reshape(3, 3)
+        if delivered := channel.receive(t):
+            status |= policy.on_depth(*delivered)
+        rotation = state.xmat[body.robot.pelvis].reshape(3, 3)
         command = lane_command(c.command, start.speed, state.qpos)
         q, qd = state.qpos[7:][body.driven], state.qvel[6:][body.driven]
-        target = policy.step(state.qvel[3:6], -turned[2], command, q, qd, t * period)
+        target = policy.step(state.qvel[3:6], -rotation[2], command, q, qd, t * period)
         status |= policy.status
         if not policy.blind and _is_due(t + latency, c) and not channel.loses_one():
             channel.send(body.image(state), t, t * period)
         state.ctrl[body.driven] = target
         force = body.advance(state)
-        speeds.append(float(turned[:, 0] @ state.qvel[:3]))
-        ending = judge.ending(state, force)
+        speeds.append(float(rotation[:, 0] @ state.qvel[:3]))
+        ending = checker.check(state, force)
         if ending:
             break
     return Trial(
@@ -85,7 +85,7 @@ def run_trial(
 def lane_command(
     c: config.Command, speed: float, qpos: Float[np.ndarray, " Q"]
 ) -> Float[np.ndarray, "3"]:
-    """Return the command of an operator who keeps the robot on the middle of its lane."""
+    """Compute the command of an operator who keeps the robot in the middle of its lane."""
     w, x, y, z = qpos[3:7]
     heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     wanted = np.clip(-c.lane_gain * qpos[1], -0.5, 0.5)  # rad
@@ -95,7 +95,7 @@ def lane_command(
 
 
 def _initial_state(body: WholeBodySim, start: Start) -> mujoco.MjData:
-    """Return the state at the start, the upper body at its default."""
+    """Create the initial state, with the upper body in its default pose."""
     state = mujoco.MjData(body.model)
     joints = body.robot.nominal_pose.astype(float)
     joints[body.driven] = start.q
@@ -106,6 +106,6 @@ def _initial_state(body: WholeBodySim, start: Start) -> mujoco.MjData:
 
 
 def _is_due(step: int, c: Config) -> bool:
-    """Return whether a frame arrives at this control step: see depth.is_due."""
+    """Check whether a frame is due at this control step, as depth.is_due does."""
     frames = c.camera.rate * c.physics.control_period
     return step > 0 and math.floor(step * frames + 1e-9) > math.floor((step - 1) * frames + 1e-9)

@@ -33,12 +33,12 @@ def choice(x, w):
 )
 def test_products_are_counted_as_often_as_they_are_made(function, flops):
     arguments = (W,) if flops == 2 * 2 * 3 * 4 * 5 else (X, W)
-    assert roofline.work_of(function, *arguments).flops == flops
+    assert roofline.count_work(function, *arguments).flops == flops
 
 
 def test_a_product_and_a_copy_each_have_their_own_limit():
     # 120 operations and 4 bytes each of 12 + 20 + 15 numbers
-    work = roofline.work_of(lambda x, w: x @ w, X, W)
+    work = roofline.count_work(lambda x, w: x @ w, X, W)
     assert work == (120, 188)
     assert work.seconds(roofline.Rates(products=60.0, memory=188.0)) == 2.0
     assert work.seconds(roofline.Rates(products=240.0, memory=18.8)) == pytest.approx(10.0)

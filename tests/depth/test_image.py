@@ -151,7 +151,7 @@ LANES = {
 def test_a_lane_looks_as_mujocos_rays_see_it(kind):
     short = {"rough": {"lane_length": 4.0, "lane_width": 0.8, "cell": 0.05}}
     c = dataclasses.replace(config.Terrain(name="mixed", lane_width=1.0), **short.get(kind, {}))
-    ground = lanes.single(c, kind, LANES[kind]).tile(0, 0)
+    ground = lanes.build_single(c, kind, LANES[kind]).tile(0, 0)
     heights = np.asarray(ground.heights, float)
     rng = np.random.default_rng(len(kind))
     for x in (0.9, 1.6, 2.4):
@@ -163,7 +163,7 @@ def test_a_lane_looks_as_mujocos_rays_see_it(kind):
 
 @pytest.mark.parametrize("kind", [kind for kind in LANES if kind != "rough"])
 def test_a_profile_is_swept_as_it_is_marched(kind):
-    atlas = lanes.single(config.Terrain(name="mixed", lane_width=1.0), kind, LANES[kind])
+    atlas = lanes.build_single(config.Terrain(name="mixed", lane_width=1.0), kind, LANES[kind])
     assert atlas.is_profile == (True,)
     ground = atlas.tile(0, 0)
     sweep = jax.jit(functools.partial(depth.render, camera=CAMERA, is_profile=True))
@@ -377,7 +377,7 @@ def test_every_tile_looks_as_if_it_were_alone():
 
 
 def test_cameras_on_different_tiles_share_one_grid():
-    whole = terrain.grid(2 * [[np.zeros((6, 5), np.float32)]], 0.02, (0.0, 0.0), (6, 5))
+    whole = terrain.build_grid(2 * [[np.zeros((6, 5), np.float32)]], 0.02, (0.0, 0.0), (6, 5))
     look = lambda row, p: depth.render(
         terrain.tile(whole, row, 0), p, jnp.eye(3), jnp.asarray(NONE), CAMERA
     )
@@ -388,14 +388,14 @@ def test_cameras_on_different_tiles_share_one_grid():
 
 def test_a_normalised_image_lies_around_zero():
     image = jnp.array([[0.0, 1.5, 3.0]])
-    np.testing.assert_allclose(depth.normalise(image, CAMERA), [[-0.5, 0.0, 0.5]])
+    np.testing.assert_allclose(depth.normalize(image, CAMERA), [[-0.5, 0.0, 0.5]])
 
 
 @pytest.mark.parametrize("window", [1, 3, 5])
 def test_a_pixel_is_the_nearest_of_those_around_it(window):
     image = np.random.default_rng(0).uniform(0.2, 3.0, (48, 64)).astype(np.float32)
     expected = scipy.ndimage.minimum_filter(image, window, mode="constant", cval=np.inf)
-    np.testing.assert_array_equal(depth.nearest_around(jnp.asarray(image), window), expected)
+    np.testing.assert_array_equal(depth.min_filter(jnp.asarray(image), window), expected)
 
 
 def due(steps, camera=CAMERA, period=0.02):
@@ -421,14 +421,14 @@ def test_most_frames_is_the_most_over_all_phases(rate, period):
     flags = due(2000, camera, period)
     for steps in (1, 2, 3, 5, 24, 100):
         found = np.convolve(flags, np.ones(steps), mode="valid").max()
-        assert depth.most_frames(steps, camera, period) == found
+        assert depth.max_frames(steps, camera, period) == found
     assert flags.mean() == pytest.approx(rate * period, abs=1e-3)
 
 
 def test_a_camera_faster_than_the_control_loop_gives_one_frame_a_step():
     fast = dataclasses.replace(CAMERA, rate=90.0)
     assert due(20, fast).all()
-    assert depth.most_frames(24, fast, 0.02) == 24
+    assert depth.max_frames(24, fast, 0.02) == 24
 
 
 def links_at(position, q):

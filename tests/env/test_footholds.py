@@ -111,7 +111,7 @@ def test_steep_and_rough_ground_has_the_eigenvalues_of_eigh():
     ("kind", "size"), [("rough", 0.1), ("slope", 0.35), ("stairs_up", 0.2), ("stairs_down", 0.23)]
 )
 def test_the_ground_of_a_lane_has_the_eigenvalues_of_eigh(kind, size):
-    ground = lanes.single(config.Terrain(name="mixed"), kind, size).tile(0, 0)
+    ground = lanes.build_single(config.Terrain(name="mixed"), kind, size).tile(0, 0)
     for x in (1.3, 2.017, 3.9):
         grid = np.stack(np.meshgrid(*footholds._lattice(C), indexing="ij"), -1)
         points = jnp.array([x, 0.003]) + geometry.rotate_yaw(jnp.float32(0.3), jnp.asarray(grid))
@@ -373,10 +373,10 @@ def test_the_samples_of_the_sole_over_a_gap_count():
     # edge at 0.06 leaves two rows of three over the gap, an edge at 0.02 three, one at -1 all
     edge = lambda x: lane(lambda at: 0.0 if at < x else -1.0)
     for x, expected in [(0.06, 6), (0.02, 9), (-1.0, 15), (0.5, 0)]:
-        np.testing.assert_array_equal(footholds.unsupported(edge(x), feet(), C), expected)
+        np.testing.assert_array_equal(footholds.count_unsupported(edge(x), feet(), C), expected)
     # turned left the foot has all of its length on one side of the edge: 1 of 3 columns, at
     # x = +0.05, is over the gap behind 0.04
-    turned = footholds.unsupported(edge(0.04), feet(heading=math.pi / 2), C)
+    turned = footholds.count_unsupported(edge(0.04), feet(heading=math.pi / 2), C)
     np.testing.assert_array_equal(turned, 5)
 
 
@@ -384,7 +384,7 @@ def test_what_is_2_cm_lower_bears_and_what_is_4_cm_lower_does_not():
     # epsilon = -3 cm from the sole, not from z = 0
     ground = lane(lambda x: 0.5)
     for above, expected in [(0.02, 0), (0.04, 15), (-0.04, 0)]:
-        found = footholds.unsupported(ground, feet(z=0.5 + above), C)
+        found = footholds.count_unsupported(ground, feet(z=0.5 + above), C)
         np.testing.assert_array_equal(found, expected)
 
 

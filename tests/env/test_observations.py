@@ -106,7 +106,7 @@ def test_the_height_scan_is_clipped(ground):
 
 def test_the_critic_sees_the_clean_observation_the_velocity_the_hidden_and_last_the_heights():
     parts = (jnp.arange(45.0), jnp.arange(3) + 50.0, jnp.arange(2) + 55.0, jnp.arange(6) + 60.0)
-    found = observations.privileged(*parts)
+    found = observations.privileged_state(*parts)
     np.testing.assert_array_equal(found, [*range(45), 50, 51, 52, 55, 56, *range(60, 66)])
 
 

@@ -46,7 +46,7 @@ def x2() -> robot.Robot:
 def perfect(x2: robot.Robot) -> rewards.Snapshot:
     """Stand as Table I wants it: every reward is 1 and every penalty 0."""
     still = jnp.zeros(3)
-    joints = jnp.zeros(len(x2.joint_names))
+    joints = jnp.zeros(x2.num_joints)
     return rewards.Snapshot(
         velocity=still,
         angular_velocity=still,
@@ -81,14 +81,14 @@ def walking(x2: robot.Robot) -> rewards.Snapshot:
 
 def joints(x2: robot.Robot, start, **changes) -> list[float]:
     """Return `start`, one number a joint, with the named joints set, rad or rad/s."""
-    values = np.array(np.broadcast_to(start, len(x2.joint_names)), np.float64)
+    values = np.array(np.broadcast_to(start, x2.num_joints), np.float64)
     for name, value in changes.items():
         values[x2.joint_names.index(f"{name}_joint")] = value
     return list(values)
 
 
 def padded(x2: robot.Robot, *values: float) -> list[float]:
-    return [*values, *[0.0] * (len(x2.joint_names) - len(values))]
+    return [*values, *[0.0] * (x2.num_joints - len(values))]
 
 
 def check(x2: robot.Robot, name: str, expected: float, **changes) -> None:

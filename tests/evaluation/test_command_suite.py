@@ -36,7 +36,7 @@ def test_who_stands_stays_within_5_cm_and_takes_no_step_after_2_s():
         trace(0.006),  # 6 cm
         trace(0.0, fell_at=480),
     )
-    found = command_suite.row(seen, command_suite.STAND, PERIOD)
+    found = command_suite.summarize_command(seen, command_suite.STAND, PERIOD)
     assert (found["trials"], found["fell"], found["stood"], found["still"]) == (4, 1, 2, 2)
     assert found["drift_m"] == pytest.approx(0.04, abs=1e-3)
 
@@ -44,7 +44,7 @@ def test_who_stands_stays_within_5_cm_and_takes_no_step_after_2_s():
 def test_the_error_is_that_of_the_mean_velocity_after_2_s():
     speed = np.where(np.arange(STEPS) < 100, 0.0, 0.5)
     seen = together(trace(speed, air=(0.4, 0.3)), trace(speed + 0.2), trace(9.0, fell_at=300))
-    found = command_suite.row(seen, (0.6, 0.0, 0.0), PERIOD)
+    found = command_suite.summarize_command(seen, (0.6, 0.0, 0.0), PERIOD)
     np.testing.assert_allclose(found["velocity"], [0.6, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(found["error"], [0.1, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(found["airborne"], [0.2, 0.15], atol=1e-9)
@@ -54,14 +54,14 @@ def test_the_error_is_that_of_the_mean_velocity_after_2_s():
 def test_a_robot_stops_where_it_is_at_the_end():
     # 0.6 m/s until 0.5 s after it is told to stop at 5 s: 30 cm
     speed = np.where(np.arange(STEPS) <= 275, 0.6, 0.0)
-    found = command_suite.stopped(trace(speed), PERIOD)
+    found = command_suite.summarize_stop(trace(speed), PERIOD)
     assert found["distance_m"] == pytest.approx(0.3, abs=1e-9) and found["fell"] == 0
 
 
 def test_when_all_have_fallen_there_are_no_numbers():
     seen = trace(0.3, fell_at=10)
-    found = {"commands": [command_suite.row(seen, command_suite.STAND, PERIOD)]}
-    found["stop"] = command_suite.stopped(seen, PERIOD)
+    found = {"commands": [command_suite.summarize_command(seen, command_suite.STAND, PERIOD)]}
+    found["stop"] = command_suite.summarize_stop(seen, PERIOD)
     assert found["commands"][0]["velocity"] is None and found["stop"]["distance_m"] is None
-    assert command_suite.text(found).row_count == 1
-    assert "0 of 1 within 5 cm" in command_suite.lines(found)
+    assert command_suite.to_table(found).row_count == 1
+    assert "0 of 1 within 5 cm" in command_suite.describe(found)

@@ -9,7 +9,7 @@ from cref_jax.evaluation import lateral_drift
 def test_drift_is_what_a_robot_is_beside_the_middle_at_the_end():
     # one goes out to 0.4 and comes back, one drifts from 0.1 to -0.2
     y = np.array([[0.1, 0.1], [0.4, 0.0], [0.1, -0.2]])
-    drift, largest = lateral_drift.spans(y)
+    drift, largest = lateral_drift.measure(y)
     np.testing.assert_allclose(drift, [0.1, 0.2])
     np.testing.assert_allclose(largest, [0.4, 0.2])
     assert lateral_drift.summarize(drift, largest) == pytest.approx(
@@ -19,5 +19,5 @@ def test_drift_is_what_a_robot_is_beside_the_middle_at_the_end():
 
 def test_what_comes_after_the_end_of_a_trial_is_another_robots():
     y = np.array([[0.1], [0.2], [-0.9]])
-    drift, largest = lateral_drift.spans(y, np.array([[True], [True], [False]]))
+    drift, largest = lateral_drift.measure(y, np.array([[True], [True], [False]]))
     np.testing.assert_allclose([drift[0], largest[0]], [0.2, 0.2])

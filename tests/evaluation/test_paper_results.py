@@ -35,7 +35,7 @@ def test_all_twenty_rates_on_stairs_follow_from_the_failures_both_ways():
 
 
 def test_one_printed_value_does_not_follow():
-    wrong = paper_results.misprints()
+    wrong = paper_results.find_misprints()
     assert list(wrong) == ["HPL, overall"]
     printed, found = wrong["HPL, overall"]
     assert printed == 74.57 and round(found, 2) == 74.50

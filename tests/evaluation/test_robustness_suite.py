@@ -12,14 +12,14 @@ from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS
 
 @pytest.fixture(scope="module")
 def world():
-    return robustness_suite.world(small_world.C, small_world.world().physics)
+    return robustness_suite.row_world(small_world.C, small_world.world().physics)
 
 
 def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():
-    rows = robustness_suite.rows()
+    rows = robustness_suite.list_rows()
     whole = [row for row in rows if row.part == EVERYTHING]
     assert len(whole) == 14 and len(rows) == 14 + 8 * 4
-    sizes = {(row.kind, robustness_suite.size(row.kind, row.level)) for row in whole}
+    sizes = {(row.kind, robustness_suite.obstacle_size(row.kind, row.level)) for row in whole}
     assert {("gap", 0.90), ("platform", 0.45), ("stairs", 0.23)} < sizes
     for part in PARTS:
         assert [row.kind for row in rows if row.part == part] == [
@@ -44,12 +44,12 @@ def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
     monkeypatch.setattr(robustness_suite.trials, "run", run)
     found = robustness_suite.run_rows(world, ppo.TrainState(*5 * [None]), 10, 0)
     (asked,) = seen
-    for k, row in enumerate(robustness_suite.rows()):
+    for k, row in enumerate(robustness_suite.list_rows()):
         part = slice(10 * k, 10 * k + 10)
         names = {world.lanes.kinds[kind] for kind in asked.kind[part]}
         assert names == set(robustness_suite.LANES[row.kind])
         sizes = world.lanes.sizes[asked.level[part], asked.kind[part]]
-        np.testing.assert_allclose(sizes, robustness_suite.size(row.kind, row.level))
+        np.testing.assert_allclose(sizes, robustness_suite.obstacle_size(row.kind, row.level))
         shares = {name: set(of[part].tolist()) for name, of in asked.spread._asdict().items()}
         on = {name for name, share in shares.items() if share == {1.0}}
         assert on == (set(PARTS) if row.part == EVERYTHING else {row.part})
@@ -57,4 +57,4 @@ def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
         np.testing.assert_array_equal(asked.number[part], np.arange(10))
         assert (found[k]["part"], found[k]["trials"], found[k]["successes"]) == (row.part, 10, 5)
     assert robustness_suite.overall(found)["rate"] == 0.5
-    assert "gap 90 cm" in str(robustness_suite.text(found).columns[0]._cells)
+    assert "gap 90 cm" in str(robustness_suite.to_table(found).columns[0]._cells)

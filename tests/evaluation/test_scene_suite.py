@@ -11,7 +11,7 @@ from cref_jax import deploy
 from cref_jax.deploy import Status
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import scene_results, scene_suite
-from cref_jax.evaluation.scene_results import Condition, Outcome
+from cref_jax.evaluation.scene_results import Condition, TrialOutcome
 from cref_jax.evaluation.scene_suite import CONDITIONS, GOOD
 from cref_jax.policy import sources
 from cref_jax.rendering import robot_scene
@@ -19,11 +19,11 @@ from cref_jax.system import parallel
 from cref_jax.whole_body import scene_files
 from cref_jax.whole_body.disturbances import Disturbance
 
-FEW = {name: scene_files.named(name) for name in ("flagstones", "steel_grate")}
+FEW = {name: scene_files.load_named(name) for name in ("flagstones", "steel_grate")}
 
 
 def outcome(ending, seconds=9.0, status=Status.OK):
-    return Outcome(ending, seconds, 5.0, 0.5, status, 0.1, 0.3)
+    return TrialOutcome(ending, seconds, 5.0, 0.5, status, 0.1, 0.3)
 
 
 def arguments(seed=0):
@@ -68,7 +68,7 @@ def test_a_trial_starts_in_the_same_way_under_every_condition(monkeypatch):
         begun.append((start.base, start.speed, disturbance))
         raise StopIteration
 
-    monkeypatch.setattr(scene_suite.stand_in, "run", note)
+    monkeypatch.setattr(scene_suite, "run_trial", note)
     r = runner()
     for condition in (GOOD, *CONDITIONS):
         with pytest.raises(StopIteration):
@@ -80,7 +80,7 @@ def test_a_trial_starts_in_the_same_way_under_every_condition(monkeypatch):
 
 def test_starts_are_where_they_should_be():
     body = runner()._body("flagstones", 0.9)
-    starts = [scene_suite.start(body, "flagstones", 0, n) for n in range(200)]
+    starts = [scene_suite.sample_start(body, "flagstones", 0, n) for n in range(200)]
     bases = np.array([s.base for s in starts])
     yaw = 2.0 * np.arctan2(bases[:, 6], bases[:, 3])
     for values, (low, high) in [
@@ -130,7 +130,7 @@ def test_a_policy_that_does_nothing_passes_nothing(monkeypatch):
     assert all(sum(r.failures.values()) == r.trials for r in verdict.conditions)
     json.dumps(verdict.as_dict(), allow_nan=False)
     out = StringIO()
-    scene_results.show(verdict, Console(file=out, width=140))
+    scene_results.print_tables(verdict, Console(file=out, width=140))
     for title in (*(s.title for s in FEW.values()), *(c.name for c in CONDITIONS)):
         assert title in out.getvalue()
 
@@ -143,7 +143,7 @@ def test_half_of_the_trials_pass_a_scene():
         GOOD: {"a": [won, lost], "b": [lost, outcome("hit"), won]},
         CONDITIONS[0]: {"a": [lost], "b": [won]},
     }
-    verdict = scene_results.verdict({"a": "A", "b": "B"}, table)
+    verdict = scene_results.build_verdict({"a": "A", "b": "B"}, table)
     assert verdict.passed == 1
     assert [r.passed for r in verdict.conditions] == [1, 1]
     assert [r.successes for r in verdict.scenes] == [1, 1]
@@ -153,17 +153,17 @@ def test_half_of_the_trials_pass_a_scene():
 
 def test_a_scenes_result_worked_by_hand():
     found = [outcome("finished", 8.0), outcome("finished", 12.0), outcome("stalled", 20.0)]
-    result = scene_results.scene_result("a", "A", found)
+    result = scene_results.summarize_scene("a", "A", found)
     assert (result.trials, result.successes, result.failures) == (3, 2, {"stalled": 1})
     assert result.seconds == 10.0
     assert result.wilson_low < result.rate == 2 / 3 < result.wilson_high
-    assert scene_results.scene_result("a", "A", found[2:]).seconds is None
+    assert scene_results.summarize_scene("a", "A", found[2:]).seconds is None
 
 
 def test_what_the_policy_said_is_counted_by_trials():
     both = Status.NO_DEPTH | Status.STALE_DEPTH
     found = [outcome("low", status=both), outcome("low", status=Status.NO_DEPTH)]
-    result = scene_results.condition_result(GOOD, {"a": found})
+    result = scene_results.summarize_condition(GOOD, {"a": found})
     assert result.said == {"NO_DEPTH": 2, "STALE_DEPTH": 1}
 
 
@@ -174,13 +174,13 @@ def test_numbers_that_cannot_be_are_one_line(bad):
 
 
 def test_a_folder_that_is_no_policy_is_one_line(tmp_path):
-    with pytest.raises(ConfigError, match="no exported policy"):
+    with pytest.raises(ConfigError, match="not an exported policy"):
         scene_suite.run_scenes(tmp_path)
 
 
 def test_a_film_is_an_mp4(tmp_path):
     with pytest.raises(ConfigError, match=r"must end in \.mp4"):
-        scene_suite.film(None, "curbs", tmp_path / "film.gif")
+        scene_suite.film_trial(None, "curbs", tmp_path / "film.gif")
 
 
 @pytest.mark.slow
@@ -192,6 +192,6 @@ def test_a_trial_can_be_filmed(tmp_path, monkeypatch):
         robot_scene.Canvas(model, 8, 8).__exit__()
     except ConfigError as error:
         pytest.skip(str(error))
-    trial = scene_suite.film(None, "curbs", tmp_path / "film.mp4")
+    trial = scene_suite.film_trial(None, "curbs", tmp_path / "film.mp4")
     assert len(trial.qpos) == math.ceil(0.2 / 0.02)
     assert (tmp_path / "film.mp4").stat().st_size > 500

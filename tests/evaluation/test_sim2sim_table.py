@@ -5,22 +5,22 @@ from rich.console import Console
 
 from cref_jax import sim2sim
 from cref_jax.evaluation import sim2sim_table
-from cref_jax.evaluation.crossing import Crossing
+from cref_jax.evaluation.crossing import LaneResult
 
 
-def crossing(successes: int, trials: int = 50, **by_cause: int) -> Crossing:
-    return Crossing("gap", 0.3, trials, successes, by_cause, 20.0, 0.6)
+def crossing(successes: int, trials: int = 50, **by_cause: int) -> LaneResult:
+    return LaneResult("gap", 0.3, trials, successes, by_cause, 20.0, 0.6)
 
 
-def shown(*cells: sim2sim_table.Cell) -> list[str]:
+def shown(*cells: sim2sim_table.CellComparison) -> list[str]:
     console = Console(width=120)
     with console.capture() as capture:
-        console.print(sim2sim_table.text(cells))
+        console.print(sim2sim_table.to_table(cells))
     return capture.get().splitlines()
 
 
 def test_flat_ground_and_the_twelve_cells_and_stairs_both_ways():
-    lanes = sim2sim_table.lanes()
+    lanes = sim2sim_table.list_lanes()
     assert list(lanes)[:3] == ["flat", "stairs 10 cm", "stairs 15 cm"]
     assert len(lanes) == 13
     assert lanes["stairs 23 cm"] == (("ascent", 0.23), ("descent", 0.23))
@@ -28,21 +28,25 @@ def test_flat_ground_and_the_twelve_cells_and_stairs_both_ways():
 
 
 def test_kept_is_the_share_of_the_successes_of_the_training_simulation():
-    both_ways = sim2sim_table.Cell(
+    both_ways = sim2sim_table.CellComparison(
         "stairs", (crossing(50), crossing(40)), (crossing(45), crossing(36))
     )
-    assert both_ways.kept == pytest.approx(81 / 90)
-    assert math.isnan(sim2sim_table.Cell("gap", (crossing(0),), (crossing(1),)).kept)
+    assert both_ways.kept_share == pytest.approx(81 / 90)
+    assert math.isnan(
+        sim2sim_table.CellComparison("gap", (crossing(0),), (crossing(1),)).kept_share
+    )
 
 
 def test_a_cell_says_both_counts_in_a_line():
-    cell = sim2sim_table.Cell("stairs", (crossing(50), crossing(40)), (crossing(45), crossing(36)))
+    cell = sim2sim_table.CellComparison(
+        "stairs", (crossing(50), crossing(40)), (crossing(45), crossing(36))
+    )
     assert cell.line() == "  training simulation 90 of 100, whole robot 81 of 100"
 
 
 def test_the_table_pools_both_ways_with_an_interval_and_causes():
     row = shown(
-        sim2sim_table.Cell(
+        sim2sim_table.CellComparison(
             "stairs 20 cm",
             (crossing(50), crossing(40)),
             (crossing(45, low=5), crossing(36, low=10, hit=4, late=0)),
@@ -54,7 +58,9 @@ def test_the_table_pools_both_ways_with_an_interval_and_causes():
 
 
 def test_where_training_never_succeeds_there_is_no_share():
-    row = shown(sim2sim_table.Cell("gap 80 cm", (crossing(0),), (crossing(0, low=50),)))[1]
+    row = shown(sim2sim_table.CellComparison("gap 80 cm", (crossing(0),), (crossing(0, low=50),)))[
+        1
+    ]
     assert row.split() == ["gap", "80", "cm", "50", "0.0", "0.0", "0-7", "50", "low"]
 
 

@@ -79,7 +79,7 @@ carried, stands, falls, blows_up = (
 
 
 def asked(count):
-    return trials.Asked(np.arange(count), *crossing.crossing_lanes(count))
+    return trials.TrialSpecs(np.arange(count), *crossing.crossing_lanes(count))
 
 
 def run(world, walker, count=4, block=3, seed=0):
@@ -117,46 +117,47 @@ def test_a_trial_does_not_depend_on_how_many_there_are(world):
         np.testing.assert_array_equal(a, b[:2])
     assert len(set(many.speed.tolist())) == 8  # each has its own command
     assert not np.array_equal(few.speed, run(world, carried, 2, seed=1).speed)
-    # two devices of three places: the last two begin where others have come to their ends
-    last = trials.Asked(*(x[6:] for x in asked(8)[:3]))
+    # two devices of three slots: the last two begin where others have come to their ends
+    last = trials.TrialSpecs(*(x[6:] for x in asked(8)[:3]))
     for a, b in zip(trials.run(world, carried, last, 0, 3), many, strict=True):
         np.testing.assert_array_equal(a, b[6:])
 
 
 def test_where_one_has_come_to_its_end_the_next_begins():
-    places = trials._Places(np.arange(8), 3)
-    # the numbers 0, 3, 6 have place 0 of a block, 1, 4, 7 place 1, and 2, 5 place 2
-    assert places.blocks == jax.device_count() == 2
-    assert places.filled().tolist() == [0, 1, 2, 3, 4, 5]
-    assert places.trial.tolist() == [0, 1, 2, 3, 4, 5]
-    places.begin(np.arange(6), np.full(6, 0.5, np.float32))
-    assert places.filled().size == 0
+    slots = trials._Slots(np.arange(8), 3)
+    # the numbers 0, 3, 6 have slot 0 of a block, 1, 4, 7 slot 1, and 2, 5 slot 2
+    assert slots.blocks == jax.device_count() == 2
+    assert slots.fill().tolist() == [0, 1, 2, 3, 4, 5]
+    assert slots.trial.tolist() == [0, 1, 2, 3, 4, 5]
+    slots.start(np.arange(6), np.full(6, 0.5, np.float32))
+    assert slots.fill().size == 0
     seen = trace(trials.CHUNK, robots=6, finished=20)
     flags = seen.ending.finished & (np.arange(6) == 4)
-    over = places.follow(seen._replace(ending=seen.ending._replace(finished=flags)), C)
+    over = slots.update(seen._replace(ending=seen.ending._replace(finished=flags)), C)
     assert list(over) == [4] and over[4].seconds == pytest.approx(21 * PERIOD)
-    assert places.filled().tolist() == [4] and places.trial.tolist() == [0, 1, 2, 3, 7, 5]
+    assert slots.fill().tolist() == [4] and slots.trial.tolist() == [0, 1, 2, 3, 7, 5]
 
 
 def test_a_trial_begins_when_frames_come_as_at_first():
     # 20 Hz at 50 Hz: the frames' pattern comes round every 5 steps
     c = config.override(C, {"network": {"variant": "full"}})
-    assert [trials._is_in_phase(c, k) for k in (0, 3, 5, 48, trials.CHUNK)] == [
+    assert [trials._is_camera_in_phase(c, k) for k in (0, 3, 5, 48, trials.CHUNK)] == [
         True, False, True, False, True,
     ]  # fmt: skip
-    assert trials._is_in_phase(C, 3), "a blind policy has no frames"
+    assert trials._is_camera_in_phase(C, 3), "a blind policy has no frames"
 
 
 def test_a_robot_begins_among_others_that_go_on(physics):
     c = dataclasses.replace(C, network=SMALL)
     world = crossing.crossing_world(c, physics, "flat", 0.0)
     old, new = (
-        trials.begin(world, seed, np.arange(2), *crossing.crossing_lanes(2)) for seed in (0, 1)
+        trials.start_robots(world, seed, np.arange(2), *crossing.crossing_lanes(2))
+        for seed in (0, 1)
     )
     old = old.replace(feed=old.feed.replace(clock=jnp.int32(50), fresh=jnp.array(True)))
     memory = jax.tree.map(jnp.ones_like, old.memory)
     old = old.replace(memory=memory, begins=jnp.zeros(2, bool))
-    found = trials._replaced(old, new, np.array([False, True]), c)
+    found = trials._replace_robots(old, new, np.array([False, True]), c)
     for k, whence in ((0, old), (1, new)):
         for name in ("env", "observation", "begins"):
             assert_equal(one(getattr(found, name), k), one(getattr(whence, name), k))
@@ -203,7 +204,7 @@ def trace(steps, robots=1, progress=0.01, **flags):
     ],
 )
 def test_what_comes_first_decides(flags, progress, ending, seconds):
-    found = trials.judged(trace(600, progress=progress, **flags), np.array([0.5]), PERIOD)
+    found = trials.classify(trace(600, progress=progress, **flags), np.array([0.5]), PERIOD)
     assert ENDINGS[found.ending[0]] == ending
     assert found.seconds[0] == pytest.approx(seconds)
     assert found.forward[0] == pytest.approx(0.5)
@@ -213,24 +214,26 @@ def test_what_comes_first_decides(flags, progress, ending, seconds):
 
 def test_stairs_are_tried_up_and_down_and_every_lane_in_turn(physics):
     kinds = ("ascent", "descent", "gap", "platform")
-    up_down = tables.lanes_of(("stairs", "hard"), 20, kinds)
+    up_down = tables.cell_lanes(("stairs", "hard"), 20, kinds)
     np.testing.assert_array_equal(up_down.kind, [0, 1] * 10)
     variants = len(protocol.LANE_SEEDS)
     assert variants == 5
     np.testing.assert_array_equal(up_down.level[:12] - 10, [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 0, 0])
-    gap = tables.lanes_of(("gap", "easy"), 6, kinds)
+    gap = tables.cell_lanes(("gap", "easy"), 6, kinds)
     np.testing.assert_array_equal(gap.kind, 2)
     np.testing.assert_array_equal(gap.level, [0, 1, 2, 3, 4, 0])
 
 
 def test_the_worlds_lanes_have_the_sizes_of_the_cells(physics):
-    world = tables.world(C, physics)
+    world = tables.cell_world(C, physics)
     kinds = world.lanes.kinds
     for cell, kind in {("stairs", "medium"): "descent", ("platform", "ood"): "platform"}.items():
-        on = tables.lanes_of(cell, 10, kinds)
+        on = tables.cell_lanes(cell, 10, kinds)
         sizes = world.lanes.sizes[on.level, kinds.index(kind)]
         np.testing.assert_array_equal(sizes, tables.cell_sizes()[cell[0]][cell[1]])
-    assert all(world.lanes.is_profile)  # so that kinds may share a block: see rollout.exposed
+    assert all(
+        world.lanes.is_profile
+    )  # so that kinds may share a block: see camera_feed.render_frames
 
 
 def made(successes, count, speed=0.45, cause="low"):
@@ -244,7 +247,7 @@ def outcomes(successes, count, **how):
     """Return the same outcome in every cell; the second half of stairs goes down."""
     down = np.arange(count) >= count // 2
     return {
-        cell: tables.Outcomes(made(successes, count, **how), down & (cell[0] == "stairs"))
+        cell: tables.CellOutcomes(made(successes, count, **how), down & (cell[0] == "stairs"))
         for cell in dict.fromkeys(
             (kind, level) for kind in tables.LANES for level in ("easy", "medium", "hard", "ood")
         )
@@ -252,7 +255,7 @@ def outcomes(successes, count, **how):
 
 
 def test_a_row_counts_failures_by_way_cause_and_speed():
-    row = tables.cells([outcomes(7, 10, speed=0.65, cause="hit")])[0]
+    row = tables.cell_rows([outcomes(7, 10, speed=0.65, cause="hit")])[0]
     assert (row["kind"], row["level"], row["size_m"]) == ("stairs", "easy", 0.10)
     assert (row["trials"], row["successes"], row["rate"]) == (10, 7, 0.7)
     assert (row["up_failures"], row["down_failures"]) == (0, 3)
@@ -266,7 +269,7 @@ def test_a_row_counts_failures_by_way_cause_and_speed():
 
 
 def test_several_policies_are_pooled_with_their_spread():
-    rows = tables.cells([outcomes(10, 10), outcomes(4, 10), outcomes(7, 10)])
+    rows = tables.cell_rows([outcomes(10, 10), outcomes(4, 10), outcomes(7, 10)])
     row = rows[-1]
     assert (row["trials"], row["successes"]) == (30, 21)
     assert row["by_policy"] == [1.0, 0.4, 0.7] and row["spread"] == pytest.approx(0.3)

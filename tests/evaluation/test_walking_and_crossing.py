@@ -37,7 +37,7 @@ def test_a_robot_with_two_causes_counts_once():
     end = ending(
         3, tilted=[True, False, False], low=[True, True, False], finished=[False, False, True]
     )
-    causes = walking._by_cause(end)
+    causes = walking._count_by_cause(end)
     assert causes == {"unstable": 0, "tilted": 1, "low": 1, "hit": 0, "dropped": 0}
 
 
@@ -89,6 +89,6 @@ def test_robots_are_judged_without_noise_or_curriculum_and_told_to_go_forward():
     [("gap", 0.305, "gap 30.5 cm: 9 of"), ("slope", 0.35, "slope 35 %: 9")],
 )
 def test_a_size_is_said_in_its_unit(kind, size, begin):
-    outcome = crossing.Crossing(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
+    outcome = crossing.LaneResult(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
     assert outcome.line().startswith(begin)
     assert outcome.line().endswith("failures: 1 low")

@@ -20,7 +20,7 @@ from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import attention, recorder
-from cref_jax.evaluation.recorder import Moment, Watched
+from cref_jax.evaluation.recorder import Moment, StepRecords
 from cref_jax.policy import writer
 from cref_jax.terrain import atlas, cross_section, lanes
 from cref_jax.terrain.cross_section import DOWN, UP
@@ -44,7 +44,7 @@ foothold_lab, gate_lab, attention_lab = map(lab, ("foothold_lab", "gate_lab", "a
 def steps_up_and_down() -> cross_section.Profile:
     """Return level ground to 1 m, treads of 0.3 m at 0.2 and 0.4 m, 0.6 m at the top, and down."""
     heights = [(10, 0.0), (3, 0.2), (3, 0.4), (10, 0.6), (3, 0.4), (3, 0.2), (8, 0.0)]
-    return cross_section.of_heights(
+    return cross_section.from_heights(
         np.repeat([z for _, z in heights], [n for n, _ in heights]), CELL
     )
 
@@ -60,7 +60,7 @@ def test_a_tread_lies_between_risers_of_one_direction():
     p = steps_up_and_down()
     assert p.flight.tolist() == [0, UP, UP, 0, DOWN, DOWN, 0]
     np.testing.assert_allclose(p.left, [0.0, 1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
-    np.testing.assert_allclose(cross_section.edges(p), [1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
+    np.testing.assert_allclose(cross_section.riser_edges(p), [1.0, 1.3, 1.6, 2.6, 2.9, 3.2])
 
 
 @pytest.mark.parametrize(
@@ -94,13 +94,13 @@ def test_the_flight_under_a_robot():
 
 def flights(rise: float) -> atlas.Atlas:
     """Return a lane with a flight up beside one with a flight down."""
-    return lanes.grid(config.Terrain(), {"ascent": (rise,), "descent": (rise,)}, [1])
+    return lanes.build_grid(config.Terrain(), {"ascent": (rise,), "descent": (rise,)}, [1])
 
 
 def test_the_stairs_have_the_tread_that_is_drawn():
     atlas = flights(0.20)
     for kind, way in enumerate((UP, DOWN)):
-        p = cross_section.of_lane(atlas.tile(0, kind))
+        p = cross_section.from_lane(atlas.tile(0, kind))
         treads = p.flight != 0
         assert set(p.flight[treads]) == {way}
         np.testing.assert_allclose((p.right - p.left)[treads], foothold_lab.TREAD, atol=1e-9)
@@ -108,7 +108,7 @@ def test_the_stairs_have_the_tread_that_is_drawn():
 
 
 def test_robots_stand_on_all_lanes_in_turn():
-    atlas = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.3,)}, [1, 2])
+    atlas = lanes.build_grid(config.Terrain(), {"flat": (0.0,), "gap": (0.3,)}, [1, 2])
     kinds, levels = recorder.round_robin_lanes(atlas, 6)
     assert list(zip(kinds, levels, strict=True)) == [
         (0, 0), (1, 0), (0, 1), (1, 1), (0, 0), (1, 0)
@@ -125,7 +125,7 @@ def test_medium_lanes_have_the_medium_sizes_of_table_2():
 
 def test_what_a_robot_walks_on():
     # flat, and one gap lane whose first trench begins where its heights leave zero
-    both = lanes.grid(config.Terrain(), {"flat": (0.0,), "gap": (0.5,)}, [1])
+    both = lanes.build_grid(config.Terrain(), {"flat": (0.0,), "gap": (0.5,)}, [1])
     edge = 0.02 * np.argmax(cross_section.middle_heights(both.tile(0, 1)) < 0)
     x = np.array([[1.0, edge - 0.6], [5.0, edge - 0.4], [9.0, edge + 0.2]])
     names = recorder.terrain_under(both, x).tolist()
@@ -134,7 +134,7 @@ def test_what_a_robot_walks_on():
 
 def test_median_absolute_deviation():
     # median 3; deviations 2, 1, 0, 1, 97 have the median 1
-    assert foothold_lab.deviation(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == 1.0
+    assert foothold_lab.median_absolute_deviation(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == 1.0
 
 
 def stairs_steps(touchdown, air_time, x, z, riser, distance):
@@ -157,7 +157,7 @@ def stairs_steps(touchdown, air_time, x, z, riser, distance):
 
 def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     atlas = flights(0.20)
-    p = cross_section.of_lane(atlas.tile(0, 0))
+    p = cross_section.from_lane(atlas.tile(0, 0))
     tread = int(np.flatnonzero(p.flight == UP)[0])
     x = np.full(5, p.left[tread] + 0.1)
     seen = stairs_steps(
@@ -170,20 +170,20 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
     )
     alive = np.array([[True, False]] * 4 + [[False, False]])
     world = SimpleNamespace(lanes=atlas, config=Config())
-    ways = foothold_lab.summed(world, Watched(alive, seen))
+    ways = foothold_lab.summarize(world, StepRecords(alive, seen))
     up, down = ways[UP], ways[DOWN]
     assert (up.robots, up.reached, up.crossed) == (1, 1, 0)
     np.testing.assert_allclose(up.position, [0.1, 0.1], atol=1e-6)
     assert (up.robot.tolist(), up.foot.tolist()) == ([0, 0], [0, 0])
     assert (up.time.tolist(), up.distance.tolist()) == ([0.02, 0.04], [0.3, np.inf])
     said = "2 touchdowns, median 10.0 cm, MAD 0.0 cm, median d_xz"
-    assert up.line().endswith(f"{said} none: half had no candidate")
+    assert up.format_touchdowns().endswith(f"{said} undefined: half had no candidate")
     nearer = up._replace(distance=np.array([0.3, 0.1]))
-    assert nearer.line().endswith(f"{said} 20.0 cm")
-    assert down.line().endswith("0 touchdowns")
+    assert nearer.format_touchdowns().endswith(f"{said} 20.0 cm")
+    assert down.format_touchdowns().endswith("0 touchdowns")
     assert (up.foot_riser, up.shank_riser, up.collided) == (2, 0, 1)
     assert (down.robots, len(down.position), down.collided) == (1, 0, 0)
-    table = list(foothold_lab.rows({"mine": ways}))
+    table = list(foothold_lab.make_rows({"mine": ways}))
     ten = pytest.approx(10.0, abs=1e-4)
     assert table[0] == ("mine", "ascent", 0, "left", 0.02, ten, pytest.approx(30.0))
     assert table[1:] == [("mine", "ascent", 0, "left", 0.04, ten, "")]
@@ -191,13 +191,13 @@ def test_only_touchdowns_before_a_failure_count_and_no_rocking():
 
 def test_toes_touch_a_riser_once_they_are_at_it(world):
     world = world.replace(lanes=flights(0.20))
-    p = cross_section.of_lane(world.lanes.tile(0, 0))
-    state = jax.tree.map(lambda a: a[0], recorder.begin(world, 0, 1).env)
+    p = cross_section.from_lane(world.lanes.tile(0, 0))
+    state = jax.tree.map(lambda a: a[0], recorder.start_robots(world, 0, 1).env)
     links = world.physics.links(state.body)
     balls = ROBOT.spheres
     x = foothold_lab.kinematics.points(links, balls.body, balls.position)[:, 0]
     toe = x[balls.foot >= 0].max()
-    feet = jax.jit(lambda s: foothold_lab._feet(world, s)[1])
+    feet = jax.jit(lambda s: foothold_lab._feet_and_riser_hits(world, s)[1])
     for away, touches in ((0.05, False), (0.008, True)):  # m; a sole's sphere has 0.01
         moved = p.left[1] - away - float(toe)
         qpos = state.body.qpos.at[jnp.array([0, 2])].add(jnp.array([moved, 0.05]))  # in the air
@@ -208,7 +208,7 @@ def test_toes_touch_a_riser_once_they_are_at_it(world):
 def test_phases_by_the_feet_in_the_air():
     airborne = np.array([[False, False], [True, False], [False, True], [True, True]])
     expected = ["double support", "single support", "single support", "flight"]
-    assert gate_lab.phases(airborne).tolist() == expected
+    assert gate_lab.contact_phases(airborne).tolist() == expected
 
 
 def turned(axis, angle):
@@ -233,7 +233,7 @@ def test_a_posture_is_risky_beyond_a_fifth_of_a_radian(axis, angle, posture):
 def test_the_gate_of_a_state_worked_by_hand():
     gate = np.array([[0.1, 0.9], [0.2, 0.9], [0.3, 0.9], [0.4, 0.5]])
     where = np.array([[True, False]] * 3 + [[False, True]])
-    row = gate_lab.summary("phase", "flight", gate, where)  # of 0.1, 0.2, 0.3 and 0.5
+    row = gate_lab.summarize_state("phase", "flight", gate, where)  # of 0.1, 0.2, 0.3 and 0.5
     assert (row.n, row.robots, row.note) == (4, 2, "n below 100")
     assert row.mean == pytest.approx(0.275)
     assert (row.q25, row.median, row.q75) == pytest.approx((0.175, 0.25, 0.35))
@@ -242,15 +242,15 @@ def test_the_gate_of_a_state_worked_by_hand():
 def test_uniform_attention_is_not_enriched_and_concentrated_attention_is_by_all_over_some():
     tokens = np.zeros((2, 48), bool)
     tokens[:, :6] = True  # n = 6 of N = 48
-    share, got = attention.shares(np.full((2, 48), 1 / 48), tokens)
+    share, got = attention.compute_shares(np.full((2, 48), 1 / 48), tokens)
     assert (share, got) == pytest.approx((6 / 48, 6 / 48))
-    share, got = attention.shares(tokens / 6.0, tokens)
+    share, got = attention.compute_shares(tokens / 6.0, tokens)
     assert got / share == pytest.approx(48 / 6)
 
 
 def test_upsampling_keeps_the_mass_where_it_was():
     weights = np.arange(48.0) / np.arange(48.0).sum()
-    image = attention.upsampled(weights, (6, 8), (48, 64))
+    image = attention.upsample(weights, (6, 8), (48, 64))
     assert image.shape == (48, 64) and image.sum() == pytest.approx(1.0)
     assert image[8:16, 16:24].sum() == pytest.approx(weights[8 + 2])  # row 1, column 2
 
@@ -277,12 +277,12 @@ def test_a_jump_of_the_ground_is_an_edge_in_its_two_rows(jump, edge):
     found = np.asarray(attention.is_edge(jnp.minimum(metres, c.d_max), c))
     rows = np.flatnonzero(found.any(axis=1)).tolist()
     assert set(rows) <= {19, 20} and bool(rows) == edge
-    tokens = attention.in_tokens(jnp.asarray(found), (6, 8))
+    tokens = attention.pool_to_tokens(jnp.asarray(found), (6, 8))
     assert np.flatnonzero(tokens).tolist() == (list(range(16, 24)) if edge else [])
 
 
 def test_rows_look_further_ahead_the_higher_they_are(world):
-    ahead = attention.ahead(world)
+    ahead = attention.ground_distances(world)
     assert ahead.shape == (6,) and (np.diff(ahead) < 0).all()
     # the camera is 1.0 to 1.2 m up and looks down by 50 deg -+ 29 deg: the row in the image's upper
     # sixth has 25.2 deg, so 1.0 / tan(25.2 deg) = 2.1 to 2.6 m, and a few cm from pelvis to camera
@@ -296,7 +296,7 @@ def test_attention_belongs_to_the_frame_of_the_step_before():
     none = np.zeros((4, 2, 48), bool)
     seen = attention_lab.Step(exposed, np.zeros((4, 2)), none, none, None, attention)
     alive = np.array([[True, True], [True, True], [True, False], [True, False]])
-    frames = attention_lab.attended(Watched(alive, seen))
+    frames = attention_lab.select_frames(StepRecords(alive, seen))
     assert frames.step.tolist() == [0, 0, 2] and frames.robot.tolist() == [0, 1, 0]
     assert frames.attention[:, 0, 0].tolist() == [1.0, 1.0, 3.0]
 
@@ -306,7 +306,7 @@ def test_the_mean_map_is_as_rich_as_attention_that_never_moves():
     attention = np.broadcast_to(rng.dirichlet(np.ones(48)), (9, 2, 48))
     edge = rng.random((9, 48)) < 0.3
     frames = attention_lab.Frames(np.arange(9), np.zeros(9, int), attention, {"ground edge": edge})
-    found = list(attention_lab.rows(frames, np.full(9, "gap"), np.arange(6.0), (6, 8)))
+    found = list(attention_lab.make_rows(frames, np.full(9, "gap"), np.arange(6.0), (6, 8)))
     assert [row.where for row in found[:2]] == ["ground edge", "row 0, 0.00 m ahead"]
     assert found[0].enrichment == pytest.approx(found[0].enrichment_of_mean_map)
     assert sum(row.attention_share for row in found[1:]) == pytest.approx(1.0)
@@ -314,17 +314,17 @@ def test_the_mean_map_is_as_rich_as_attention_that_never_moves():
 
 def test_onsets():
     flag = np.array([True, True, False, True, False])
-    assert recorder.onsets(flag).tolist() == [True, False, False, True, False]
+    assert recorder.find_onsets(flag).tolist() == [True, False, False, True, False]
 
 
 @pytest.mark.parametrize(
     ("call", "said"),
     [
         (lambda: recorder.default_num_envs(0, 9), "--num-envs must be at least 1"),
-        (lambda: recorder.steps_of(0.0, Config()), "--seconds must be above 0, up to 40"),
-        (lambda: recorder.steps_of(float("nan"), Config()), "--seconds must be above 0"),
-        (lambda: recorder.kind_of_lane(Config(), "gpa"), "did you mean 'gap'"),
-        (lambda: cli.writable(Path("gate.jpg"), ".png"), "--out must end in .png"),
+        (lambda: recorder.count_steps(0.0, Config()), "--seconds must be above 0, up to 40"),
+        (lambda: recorder.count_steps(float("nan"), Config()), "--seconds must be above 0"),
+        (lambda: recorder.choose_kind(Config(), "gpa"), "did you mean 'gap'"),
+        (lambda: cli.prepare_output(Path("gate.jpg"), ".png"), "--out must end in .png"),
     ],
 )
 def test_a_mistake_is_one_line(call, said):
@@ -335,19 +335,19 @@ def test_a_mistake_is_one_line(call, said):
 def test_labels_must_differ():
     for wrong in (("a=1", "a=2"), ("a",), ("=1",)):
         with pytest.raises(ConfigError, match="different LABEL=PATH"):
-            foothold_lab.named(foothold_lab.Options(policies=wrong))
+            foothold_lab.resolve_labels(foothold_lab.Options(policies=wrong))
 
 
 @pytest.mark.parametrize("variant", ["blind", "no_cross_attention"])
 def test_a_policy_without_attention_is_refused(variant):
     with pytest.raises(ConfigError, match=f"no attention: its variant is '{variant}'"):
-        attention_lab.check(policy(variant).config)
+        attention_lab.check_variant(policy(variant).config)
 
 
 def test_a_policy_without_a_gate_is_refused_and_a_blind_one_is_not(capsys):
     with pytest.raises(ConfigError, match="no gate: its variant is 'no_highway'"):
-        gate_lab.check(policy("no_highway").config)
-    gate_lab.check(policy("blind").config)
+        gate_lab.check_variant(policy("no_highway").config)
+    gate_lab.check_variant(policy("blind").config)
     assert "blind" in capsys.readouterr().out
 
 
@@ -403,11 +403,11 @@ def counted(world: World, moment: Moment) -> Count:
 def test_nothing_counts_from_a_robots_end_on():
     blind = policy("blind")
     world = build_world(blind.config, "mujoco")
-    world = recorder.place_robots(
-        blind.config, world, lanes.single(Config().terrain, "flat", 0.0), 0.6
+    world = recorder.make_trial_world(
+        blind.config, world, lanes.build_single(Config().terrain, "flat", 0.0), 0.6
     )
-    robots = recorder.begin(world, 0, 4)
-    watched = recorder.watch(world, blind.train, robots, 200, counted)
+    robots = recorder.start_robots(world, 0, 4)
+    watched = recorder.record(world, blind.train, robots, 200, counted)
     alive, seen = watched
     assert alive[0].all() and not alive[-1].any()  # a random policy falls within 4 s
     assert len(alive) % recorder.CHUNK == 0 and len(alive) < 200  # and then it is over

@@ -20,9 +20,9 @@ VARIANTS = ("full", "no_cross_attention", "no_grf", "no_highway")
 
 def some_sight(held=HELD, seed=5):
     images = jax.random.uniform(jax.random.key(seed), (K, E, 48, 64), minval=-0.5, maxval=0.5)
-    frames = network.in_patches(C, images)
+    frames = network.image_to_patches(C, images)
     seen = jnp.ones((len(held), E), bool).at[:2, 1].set(False)
-    return network.Sight(frames, jnp.broadcast_to(held[:, None], (len(held), E)), seen)
+    return network.DepthInput(frames, jnp.broadcast_to(held[:, None], (len(held), E)), seen)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_stepping_with_cached_features_agrees_with_the_whole_sequence(params, ob
     carry = START
     for t in range(T):
         features = encode(params, sight.frames[HELD[t]][None])
-        view = network.View(features, jnp.zeros((1, E), int), sight.seen[t][None])
+        view = network.EncodedInput(features, jnp.zeros((1, E), int), sight.seen[t][None])
         carry, out = decide(params, carry, obs[t][None], NEVER[:1], view)
         np.testing.assert_allclose(out.mean[0], whole.mean[t], atol=1e-5)
         np.testing.assert_allclose(out.velocity[0], whole.velocity[t], atol=1e-5)
@@ -111,7 +111,7 @@ def test_attention_agrees_with_projected_keys_and_values():
     x = jax.random.normal(jax.random.key(0), (T, E, 8))
     tokens = jax.random.normal(jax.random.key(1), (T, E, TOKENS, 8))
     module = modules.CrossAttention(heads=2)
-    every = frame_slots.holding(jnp.arange(T), T, 1)
+    every = frame_slots.assign_slots(jnp.arange(T), T, 1)
     params = jax.jit(module.init)(jax.random.key(2), x, tokens, every)
     found, weights = jax.jit(module.apply)(params, x, tokens, every)
 
@@ -142,7 +142,7 @@ def test_attention_finds_the_token_that_answers_the_query():
         {"params": params},
         jnp.array([[[1.0, -1.0]]]),
         tokens,
-        frame_slots.holding(jnp.zeros(1, int), 1, 1),
+        frame_slots.assign_slots(jnp.zeros(1, int), 1, 1),
     )
     assert int(weights[0, 0, 0].argmax()) == 3
     np.testing.assert_allclose(weights[0, 0, 0, 3], 1.0, atol=1e-6)
@@ -169,8 +169,8 @@ def test_convolution_agrees_with_xla(kernel, stride):
 def test_tokens_are_local_and_in_the_order_of_the_image():
     frames = jnp.zeros((1, 1, 48, 64))
     tokenizer = modules.DepthTokenizer(C)
-    tokens = jax.jit(lambda p, images: tokenizer.apply(p, network.in_patches(C, images)))
-    params = jax.jit(tokenizer.init)(jax.random.key(0), network.in_patches(C, frames))
+    tokens = jax.jit(lambda p, images: tokenizer.apply(p, network.image_to_patches(C, images)))
+    params = jax.jit(tokenizer.init)(jax.random.key(0), network.image_to_patches(C, frames))
     flat = tokens(params, frames)
     spot = tokens(params, frames.at[0, 0, 16:20, 32:36].set(1.0))
     moved = np.flatnonzero(np.abs(spot - flat)[0, 0].max(axis=-1) > 1e-6)
@@ -182,7 +182,7 @@ def test_tokens_are_local_and_in_the_order_of_the_image():
 def test_compression_is_a_layer_on_the_means_of_blocks():
     frames = jnp.zeros((1, 1, 48, 64)).at[0, 0, 8:16, 16:24].set(0.5)  # block row 1, column 2
     c = config.override(C, {"compressed": 3})
-    module, frames = modules.DepthCompression(c), network.in_patches(c, frames)
+    module, frames = modules.DepthCompression(c), network.image_to_patches(c, frames)
     params = jax.jit(module.init)(jax.random.key(0), frames)
     kernel = params["params"]["layer_0"]["kernel"]
     expected = nn.elu(0.5 * kernel[1 * 8 + 2])
@@ -229,9 +229,11 @@ def test_without_the_highway_the_feature_reaches_the_action_through_memory_alone
 
 
 def test_a_policy_that_sees_refuses_to_walk_blind_and_a_blind_one_to_look(obs, params):
-    with pytest.raises(ValueError, match="frames are for every variant but 'blind'"):
+    with pytest.raises(ValueError, match="all variants but 'blind' take frames; this is 'full'"):
         actor().apply(params, START, obs, NEVER)
     blind = jax.jit(actor("blind").init)(jax.random.key(0), START, obs, NEVER)
-    view = network.View(network.no_features(C, (48, 64), E), jnp.zeros((T, E), int), NEVER)
-    with pytest.raises(ValueError, match="not for blind"):
+    view = network.EncodedInput(
+        network.zero_features(C, (48, 64), E), jnp.zeros((T, E), int), NEVER
+    )
+    with pytest.raises(ValueError, match="this is 'blind'"):
         actor("blind").apply(blind, START, obs, NEVER, view, method="decide")

@@ -54,26 +54,28 @@ def test_a_filter_begins_with_the_parameters_of_a_convolution():
 
 def test_slots_are_taken_in_turn():
     # frame 0 for two steps, frame 1 for three, frame 2 for one, frame 3 never
-    h = frame_slots.holding(jnp.array([0, 0, 1, 1, 1, 2]), frames=4, slots=3)
+    h = frame_slots.assign_slots(jnp.array([0, 0, 1, 1, 1, 2]), frames=4, slots=3)
     assert h.slot.tolist() == [0, 1, 0, 1, 2, 0]
     assert h.taken.astype(int).tolist() == [[1, 1, 0], [1, 1, 1], [1, 0, 0], [0, 0, 0]]
     assert np.asarray(h.step)[np.asarray(h.taken)].tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_what_is_told_by_step_comes_back_from_the_slots_and_so_does_its_gradient():
-    h = frame_slots.holding(jnp.array([0, 0, 1, 1, 1, 2]), frames=4, slots=3)
+    h = frame_slots.assign_slots(jnp.array([0, 0, 1, 1, 1, 2]), frames=4, slots=3)
     x = jax.random.normal(jax.random.key(0), (6, 2, 5))
-    np.testing.assert_array_equal(frame_slots.by_step(frame_slots.by_frame(x, h), h), x)
+    np.testing.assert_array_equal(
+        frame_slots.gather_by_step(frame_slots.gather_by_frame(x, h), h), x
+    )
 
     # the gradients are those of the plain look-ups, which JAX adds up by index
     weight = jax.random.normal(jax.random.key(1), (4, 2, 3, 5))
     taken = jnp.where(h.taken[:, None, :, None], weight, 0.0)
     plain = lambda x: jnp.sum(taken * x[h.step[:, None], jnp.arange(2)[:, None]])
-    ours = lambda x: jnp.sum(taken * frame_slots.by_frame(x, h))
+    ours = lambda x: jnp.sum(taken * frame_slots.gather_by_frame(x, h))
     np.testing.assert_allclose(jax.grad(ours)(x), jax.grad(plain)(x), atol=1e-6)
 
     back = lambda y: jnp.sum(x * y[h.frame, :, h.slot])
-    found = jax.grad(lambda y: jnp.sum(x * frame_slots.by_step(y, h)))(weight)
+    found = jax.grad(lambda y: jnp.sum(x * frame_slots.gather_by_step(y, h)))(weight)
     np.testing.assert_allclose(found, jax.grad(back)(weight), atol=1e-6)
 
 

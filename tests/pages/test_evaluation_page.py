@@ -79,8 +79,8 @@ def test_a_difference_is_said_in_words(tmp_path):
 def test_how_much_the_intervals_leave_open_is_said(tmp_path):
     # narrowest: stairs easy, 0.954 to 1.0, half of it 2.3; widest: platform, (0.033 + 0.027) / 2
     text = written(eval_records.table(), tmp_path).text
-    assert "With 200 trials a cell, the 95 % intervals (Wilson) reach 2.3 to 3.0 points" in text
-    assert "The paper counts 2000 trials a cell." in text
+    assert "With 200 trials per cell, the 95 % intervals (Wilson) extend 2.3 to 3.0 points" in text
+    assert "The paper has 2000 trials per cell." in text
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_how_much_the_intervals_leave_open_is_said(tmp_path):
     [
         ("by_speed", "Success by commanded speed"),
         ("up_failures", "Failures on the way up and down"),
-        ("paper", "The paper counts"),
+        ("paper", "The paper has"),
         ("by_policy", "spread, points"),
         ("failures", "tilted too far"),
     ],
@@ -139,15 +139,16 @@ def test_success_with_each_part_alone_is_shown(tmp_path):
     part = {"kind": "gap", "level": "medium", "size_m": 0.5, "trials": 50, "successes": 41}
     rows = [part | {"part": "pushes", "rate": 0.82}, part | {"part": "noise", "rate": 0.96}]
     seen = written(eval_records.table() | {"suite": "robust", "parts": rows}, tmp_path)
-    assert "Success with everything randomised" in seen.text
+    assert "Success under full randomisation" in seen.text
     assert row(seen, "pushes") == ["pushes", "82.0 %"]
     assert row(seen, "noise") == ["noise", "96.0 %"]
 
 
 def test_how_commands_are_obeyed_is_shown(tmp_path):
     seen = written(eval_records.COMMANDS, tmp_path)
-    assert "33 of 40told to stand, move less than 5 cm" in seen.text
-    assert "29 of 40told to stand, take no step" in seen.text and "42 cmfurther" in seen.text
+    assert "33 of 40commanded to stand, move less than 5 cm" in seen.text
+    assert "29 of 40commanded to stand, take no step" in seen.text
+    assert "42 cmstopping distance" in seen.text
     stand = row(seen, "0.00, 0.00, 0.00")
     assert stand[1:] == ["0.01, -0.00, 0.02", "0.01, 0.01, 0.02", "1 of 40", "16.0 %, 17.0 %"]
     assert row(seen, "0.60, 0.00, 0.00")[3] == "40 of 40"
@@ -172,7 +173,7 @@ def test_the_records_of_one_kind_are_shown(tmp_path):
     ],
 )
 def test_a_record_of_another_form_is_one_line(tmp_path, record):
-    with pytest.raises(ConfigError, match="no form that is known"):
+    with pytest.raises(ConfigError, match="has an unknown form"):
         evaluation_page.write(record, tmp_path / "a.html")
     assert not (tmp_path / "a.html").exists()
 
@@ -187,7 +188,7 @@ def test_names_with_markup_or_formulas_are_shown_as_they_are(tmp_path):
 
 
 def test_a_cause_that_is_new_has_its_own_name():
-    failures = [evaluation_charts.Failures("gap", 10, {"struck by lightning": 2})]
+    failures = [evaluation_charts.FailureCounts("gap", 10, {"struck by lightning": 2})]
     assert "<img" in evaluation_charts.failure_chart(failures)
     assert evaluation_charts.display_name("struck by lightning") == "struck by lightning"
 

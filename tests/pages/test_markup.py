@@ -29,17 +29,17 @@ def test_text_never_becomes_markup_wherever_it_stands():
         "code": markup.code(EVIL),
         "note": markup.note("see ", EVIL),
         "tile": markup.tiles([(EVIL, EVIL)]),
-        "pair": markup.pairs([(EVIL, EVIL)]),
+        "pair": markup.definition_list([(EVIL, EVIL)]),
         "table": markup.table([Column(EVIL), Column(EVIL, True)], [(EVIL, EVIL)], EVIL),
-        "folded": markup.folded(EVIL, EVIL),
+        "collapsible": markup.collapsible(EVIL, EVIL),
         "attribute": markup.element("p", "x", title=EVIL),
-        "nested": markup.nested([Section(EVIL, markup.paragraph("x"))]),
+        "subsections": markup.subsections([Section(EVIL, markup.paragraph("x"))]),
     }
     for name, part in parts.items():
         seen = Page(whole(part))
         assert not {"script", "img"} & set(seen.tags), name
         assert EVIL in seen.text or name == "attribute"
-    seen = Page(markup.document(EVIL, markup.escaped(EVIL), [Section(EVIL, markup.Html())], EVIL))
+    seen = Page(markup.document(EVIL, markup.escape(EVIL), [Section(EVIL, markup.Html())], EVIL))
     assert seen.text.count(EVIL) == 6  # title, heading, lead, link, section, foot
     assert not {"script", "img"} & set(seen.tags)
 
@@ -100,7 +100,7 @@ def test_a_film_is_in_the_page_or_named_where_it_is_too_large(tmp_path):
 @pytest.mark.parametrize("name", ["a.png", "a.mp4"])
 def test_a_file_that_is_not_what_its_name_says_is_a_note(tmp_path, name):
     (tmp_path / name).write_bytes(b"<svg onload=alert(1)>")
-    assert f"is no {name[2:]} file" in Page(markup.media(tmp_path / name)).text
+    assert f"is not a valid {name[2:]} file" in Page(markup.media(tmp_path / name)).text
     assert "cannot be read" in markup.media(tmp_path / f"b{name[1:]}")
 
 
@@ -110,7 +110,7 @@ def test_a_row_with_a_cell_too_few_is_refused():
 
 
 def test_a_page_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path):
-    with pytest.raises(ConfigError, match=r"ends in \.html, and .*a\.pdf does not"):
+    with pytest.raises(ConfigError, match=r"must end in \.html: .*a\.pdf"):
         markup.write(tmp_path / "a.pdf", "x")
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="cannot write"):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from cref_jax import config, errors, geometry, robot, terrain
-from cref_jax.physics.records import Body, Dynamics
+from cref_jax.physics.records import Body, Dynamics, SubstepInput
 from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.robot import kinematics
 
@@ -461,7 +461,7 @@ def test_batches_of_batches_have_room_for_every_contact(physics, x2, put_down, e
 
     def force(body: Body) -> np.ndarray:
         planes, rest = p.planes(flat, body), jnp.asarray(x2.rest_pose)
-        return p.engine.substep(*body, rest, *planes, p.nominal_dynamics()).force
+        return p.engine.substep(SubstepInput(*body, rest, *planes, p.nominal_dynamics())).force
 
     halves = jax.tree.map(lambda x: x.reshape(2, ROBOTS // 2, -1), body)
     found = np.asarray(jax.jit(jax.vmap(jax.vmap(force)))(halves)).reshape(ROBOTS, 2, 3)
@@ -491,7 +491,7 @@ def test_a_robot_alone_is_the_same_as_in_a_batch_bit_for_bit(physics, x2):
     inputs = (*body, target, *planes, dynamics)
     batch = jax.vmap(p.engine.substep)(*inputs)
     for i in (0, 7, 199):
-        alone = p.engine.substep(*jax.tree.map(lambda x, i=i: x[i], inputs))
+        alone = p.engine.substep(SubstepInput(*jax.tree.map(lambda x, i=i: x[i], inputs)))
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_array_equal(a, b[i]), tuple(alone), tuple(batch)
         )

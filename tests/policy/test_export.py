@@ -56,7 +56,7 @@ def test_a_runtime_that_says_something_else_fails_its_test(directory, monkeypatc
 
 @pytest.mark.slow
 def test_the_vectors_hold_a_reset_a_frame_with_holes_and_the_true_rate(small_world):
-    found = reference_vectors.test_vectors(small_world, trained(small_world).train)
+    found = reference_vectors.build_test_vectors(small_world, trained(small_world).train)
     assert found["reset"].sum() == 2 and found["reset"][reference_vectors.STEPS // 2]
     assert set(np.diff(found["frame_step"][:10])) == {2, 3}
     holed = found["frames"][reference_vectors.HOLED]
@@ -70,7 +70,9 @@ def test_a_policy_comes_back_as_it_went(directory, small_world):
     was, found = trained(small_world), reader.read(directory, small_world)
     assert found.config == was.config and found.iteration == was.iteration
     steps = recorded(20)
-    say = lambda train: reference_vectors.reference(SMALL, train, ROBOT, was.config.robot, steps)
+    say = lambda train: reference_vectors.compute_reference(
+        SMALL, train, ROBOT, was.config.robot, steps
+    )
     np.testing.assert_array_equal(say(found.train)["action"], say(was.train)["action"])
 
 

@@ -55,5 +55,5 @@ def test_a_file_that_is_something_else_is_refused(small, tmp_path):
     with pytest.raises(ConfigError, match="cannot read"):
         learner_file.read_config(path)
     np.savez(path, kernel=np.zeros(3))
-    with pytest.raises(ConfigError, match="not what export --learner writes"):
+    with pytest.raises(ConfigError, match="not written by export --learner"):
         learner_file.read_config(path)

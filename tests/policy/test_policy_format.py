@@ -22,7 +22,7 @@ MUTATIONS = 10_000
 def files() -> dict[str, bytes]:
     """Return the files of a small policy that is whole."""
     manifest, arrays = contents(policy("full"))
-    return signed(manifest, {"weights.npz": writer._npz(arrays)})
+    return signed(manifest, {"weights.npz": writer._to_npz(arrays)})
 
 
 def signed(manifest, files) -> dict[str, bytes]:
@@ -61,7 +61,7 @@ def npz(arrays, **settings) -> bytes:
 def test_what_was_written_is_read_from_the_directory_and_from_the_archive(tmp_path, files):
     original = contents(policy("full"))
     put(tmp_path, files)
-    (tmp_path / "policy.zip").write_bytes(writer._stored(files))
+    (tmp_path / "policy.zip").write_bytes(writer._zip_stored(files))
     for path in (tmp_path, tmp_path / "policy.zip"):
         manifest, arrays = deploy.contents(path)
         assert {k: manifest[k] for k in original[0]} == json.loads(json.dumps(original[0]))
@@ -94,9 +94,9 @@ def bad_weights(files):
     whole = dict(np.load(io.BytesIO(files["weights.npz"])))
     name = "action_head/layer_2/bias"
     one = lambda x: {**whole, name: x}
-    yield "objects", npz(one(np.array([{}] * J, object))), "no array of numbers"
+    yield "objects", npz(one(np.array([{}] * J, object))), "not an array of numbers"
     yield "another type", npz(one(whole[name].astype(np.float64))), "must be float32"
-    yield "big endian", npz(one(whole[name].astype(">f4"))), "no array of numbers"
+    yield "big endian", npz(one(whole[name].astype(">f4"))), "not an array of numbers"
     yield "another shape", npz(one(whole[name][:-1])), "must be float32"
     yield "NaN", npz(one(np.full(J, np.nan, np.float32))), "not finite"
     yield "one missing", npz({k: x for k, x in whole.items() if k != name}), f"no '{name}'"
@@ -107,7 +107,7 @@ def bad_weights(files):
     yield "one array", npy(whole[name]), ""
     huge = npy(whole[name]).replace(b"(12,), }", b"(1000000000000,), }")
     assert len(huge) > len(npy(whole[name]))
-    yield "a false size", archive({f"{name}.npy": huge}), "not the size"
+    yield "a false size", archive({f"{name}.npy": huge}), "does not have the size"
     twice = io.BytesIO(files["weights.npz"])
     with zipfile.ZipFile(twice, "a") as more, pytest.warns(UserWarning, match="Duplicate"):
         more.writestr(f"{name}.npy", npy(whole[name]))
@@ -123,7 +123,7 @@ def npy(array) -> bytes:
 
 
 def archive(files) -> bytes:
-    return writer._stored(files)
+    return writer._zip_stored(files)
 
 
 def test_damaged_weights_are_refused_even_where_the_digest_is_right(tmp_path, files):

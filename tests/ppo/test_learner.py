@@ -137,9 +137,9 @@ def test_surrogate_worked_by_hand():
     # Loss: A = -2: r 1.5 -> min(-3, -2.4) = -3 ; r .5 -> min(-1, -1.6) = -1.6 ; r 1.1 -> -2.2
     ratio = jnp.array([[1.5, 0.5, 1.1, 1.5, 0.5, 1.1]])
     advantage = jnp.array([[2.0, 2.0, 2.0, -2.0, -2.0, -2.0]])
-    out = losses.surrogate(ratio, advantage, 0.2)
+    out = losses.surrogate_loss(ratio, advantage, 0.2)
     np.testing.assert_allclose(out[0], [-2.4, -1.0, -2.2, 3.0, 1.6, 2.2], rtol=1e-6)
-    slope = jax.grad(lambda r: losses.surrogate(r, advantage, 0.2).sum())(ratio)
+    slope = jax.grad(lambda r: losses.surrogate_loss(r, advantage, 0.2).sum())(ratio)
     np.testing.assert_allclose(slope[0], [0.0, -2.0, -2.0, 2.0, 0.0, 2.0])
 
 
@@ -252,7 +252,7 @@ def test_asymmetry_is_what_the_mirrored_policy_does_otherwise():
     batch = judge(some_rollout())
     batch = batch._replace(twin_obs=-batch.obs, twin=())
     _, said = networks.actor(params.actor, (), batch.obs, None, None)
-    found = losses.asymmetry(params.actor, batch, said.mean, networks.actor, networks.mirror)
+    found = losses.asymmetry_error(params.actor, batch, said.mean, networks.actor, networks.mirror)
     np.testing.assert_allclose(found, 0.2, rtol=1e-5)
     c = dataclasses.replace(C, mirror_weight=3.0)
     with_it, parts = losses.loss(params, batch, c, networks)
@@ -413,7 +413,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted():
     state = initial_state()
     bad = jax.tree.map(lambda p: jnp.full_like(p, jnp.nan), state.params)
     bad = state.params._replace(critic=bad.critic)
-    opt = ppo.optimiser(C)
+    opt = ppo.optimizer(C)
     changes, after = jax.jit(opt.update)(bad, state.opt_state, state.params)
     assert not any(np.any(x) for x in jax.tree.leaves(changes))
     assert int(after.total_notfinite) == 1 and int(after.notfinite_count) == 1
@@ -445,7 +445,7 @@ def test_an_update_of_bad_gradients_changes_no_parameter():
     ],
 )
 def test_learning_rate_adaptation_worked_by_hand(rate, kl, expected):
-    out = ppo.adapt(jnp.array(rate), jnp.array(kl), config.PPO())
+    out = ppo.adapt_learning_rate(jnp.array(rate), jnp.array(kl), config.PPO())
     np.testing.assert_allclose(out, expected, rtol=1e-6)
 
 
@@ -455,11 +455,11 @@ def test_the_learning_rate_is_part_of_the_state_and_goes_on_from_there():
     kls = losses.kl.ravel()
     rate = C.learning_rate
     for i in range(rates.size):
-        rate = float(ppo.adapt(jnp.array(rate), kls[i], C))
+        rate = float(ppo.adapt_learning_rate(jnp.array(rate), kls[i], C))
         np.testing.assert_allclose(rates[i], rate, rtol=1e-5)
     assert rate != C.learning_rate
     _, again = update(state, some_rollout(), jax.random.key(1))
-    held = float(ppo.adapt(rates[-1], again.kl[0, 0], C))
+    held = float(ppo.adapt_learning_rate(rates[-1], again.kl[0, 0], C))
     np.testing.assert_allclose(again.learning_rate[0, 0], held, rtol=1e-6)
 
 
@@ -516,11 +516,11 @@ def test_statistics_are_those_of_all_valid_samples():
 def test_normalisation_is_bounded_and_undoes_scale():
     statistics = initial_state().statistics.obs
     x = 5.0 + 2.0 * jax.random.normal(jax.random.key(0), (400, 50, OBS))
-    statistics = ppo.observe(statistics, x, jnp.ones((400, 50), bool))
-    out = ppo.normalise(statistics, x)
+    statistics = ppo.update_statistics(statistics, x, jnp.ones((400, 50), bool))
+    out = ppo.normalize(statistics, x)
     np.testing.assert_allclose(out.mean((0, 1)), 0.0, atol=1e-3)
     np.testing.assert_allclose(out.std((0, 1)), 1.0, rtol=1e-3)
-    assert float(ppo.normalise(statistics, jnp.full((1, OBS), 1e9)).max()) == ppo.OBSERVATION_CLIP
+    assert float(ppo.normalize(statistics, jnp.full((1, OBS), 1e9)).max()) == ppo.OBSERVATION_CLIP
 
 
 def test_devices_that_share_the_robots_learn_what_one_would():

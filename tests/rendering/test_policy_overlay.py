@@ -1,47 +1,47 @@
-"""The picture of what the policy sees and does."""
+"""The panel with the policy's depth image, attention and gate."""
 
 import numpy as np
 
 from cref_jax.rendering import policy_overlay
-from cref_jax.rendering.policy_overlay import Mind
+from cref_jax.rendering.policy_overlay import PolicyView
 
 PERIOD = 0.02  # s
 HEIGHT = 540
 
 
-def drawn(mind, sees=True):
-    return policy_overlay.draw(mind, HEIGHT, d_max=3.0, period=PERIOD, sees=sees)
+def draw(view, sees=True):
+    return policy_overlay.draw(view, HEIGHT, d_max=3.0, period=PERIOD, sees=sees)
 
 
-def some_mind(**changes):
+def some_view(**changes):
     gates = np.tile(np.linspace(0.2, 0.8, 16), (50, 1))
-    mind = Mind(np.zeros((48, 64)), np.full(48, 1 / 48), gates)
-    return mind._replace(**changes)
+    view = PolicyView(np.zeros((48, 64)), np.full(48, 1 / 48), gates)
+    return view._replace(**changes)
 
 
 def test_it_has_the_height_of_the_picture_beside_it():
     for sees in (True, False):
-        assert drawn(some_mind(), sees).shape == (HEIGHT, policy_overlay.WIDTH, 3)
-    assert drawn(some_mind()).dtype == np.uint8
+        assert draw(some_view(), sees).shape == (HEIGHT, policy_overlay.WIDTH, 3)
+    assert draw(some_view()).dtype == np.uint8
 
 
 def test_near_is_red_and_far_is_blue():
     depth = np.full((48, 64), 0.5)  # d_max
     depth[:, :32] = -0.4  # 0.3 m
-    image = drawn(some_mind(depth=depth)).astype(int)
+    image = draw(some_view(depth=depth)).astype(int)
     row = image[150, policy_overlay.MARGIN + 5 : policy_overlay.WIDTH - policy_overlay.MARGIN - 5]
     near, far = row[20], row[-20]
     assert near[0] > 2 * near[2] and far[2] > far[0]
 
 
 def test_each_part_shows_what_it_is_given():
-    base = drawn(some_mind())
+    base = draw(some_view())
     weights = np.zeros(48)
     weights[5] = 1.0
     changed = {
-        "depth": drawn(some_mind(depth=np.full((48, 64), -0.3))),
-        "attention": drawn(some_mind(attention=weights)),
-        "gates": drawn(some_mind(gates=np.full((50, 16), 0.1))),
+        "depth": draw(some_view(depth=np.full((48, 64), -0.3))),
+        "attention": draw(some_view(attention=weights)),
+        "gates": draw(some_view(gates=np.full((50, 16), 0.1))),
     }
     rows = {
         name: np.flatnonzero((image != base).any(axis=(1, 2))) for name, image in changed.items()
@@ -51,5 +51,5 @@ def test_each_part_shows_what_it_is_given():
 
 
 def test_before_the_first_frame_it_is_grey_and_does_not_fail():
-    image = drawn(Mind(None, None, np.full((1, 16), 0.5)))
+    image = draw(PolicyView(None, None, np.full((1, 16), 0.5)))
     assert (image[100, 100] == policy_overlay.FAINT).all()

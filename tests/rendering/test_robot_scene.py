@@ -15,7 +15,7 @@ SMOOTH = [("slope", 0.2), ("rough", 0.06)]
 
 
 def lane(kind, size):
-    return lanes.single(config.Terrain(), kind, size).tile(0, 0)
+    return lanes.build_single(config.Terrain(), kind, size).tile(0, 0)
 
 
 def heights_seen(model, points):
@@ -34,7 +34,7 @@ def heights_seen(model, points):
 def test_the_boxes_cover_every_column_once_at_its_height(seed):
     rng = np.random.default_rng(seed)
     heights = rng.choice([0.0, 0.1, -1.0], (13, 9), p=[0.8, 0.1, 0.1]).astype(np.float32)
-    found = geoms.boxes(heights, tile=4)
+    found = geoms.merge_boxes(heights, tile=4)
     assert found is not None
     times, painted = np.zeros(heights.shape, int), np.full(heights.shape, np.nan)
     for (i, j), (along, across), height, _ in zip(*found, strict=True):
@@ -47,7 +47,7 @@ def test_the_boxes_cover_every_column_once_at_its_height(seed):
 def test_tones_take_turns_at_risers_and_tiles():
     # one row; a tile is 3 columns. Level: 3 + 2, a step: 2, a landing: 3 + 3 + 1
     profile = np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2, 2, 2, 2, 2], np.float32)
-    found = geoms.boxes(profile[:, None], tile=3)
+    found = geoms.merge_boxes(profile[:, None], tile=3)
     assert found is not None
     assert found.size[:, 0].tolist() == [3, 2, 2, 3, 3, 1]
     assert found.tone.tolist() == [0, 1, 0, 1, 0, 1]
@@ -56,7 +56,7 @@ def test_tones_take_turns_at_risers_and_tiles():
 @pytest.mark.parametrize(("kind", "size"), BOXED)
 def test_a_lane_of_level_pieces_takes_few_boxes(kind, size):
     heights, _ = robot_scene.window(lane(kind, size))
-    found = geoms.boxes(heights, tile=50)
+    found = geoms.merge_boxes(heights, tile=50)
     assert found is not None
     assert len(found.tone) <= (50 if "stairs" in kind else 25)
 

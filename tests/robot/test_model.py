@@ -101,7 +101,7 @@ def test_the_right_side_mirrors_the_left_in_pose_and_limits():
 def test_only_the_actuated_joints_move(actuated, nv, nu):
     compiled = robot.spec(actuated, config.Physics()).compile()
     r = robot.load(config.Robot(actuated=actuated, held="none"))
-    assert (compiled.nv, compiled.nu, len(r.joint_names)) == (nv, nu, nu)
+    assert (compiled.nv, compiled.nu, r.num_joints) == (nv, nu, nu)
     # motor i turns joint i, behind the freejoint
     np.testing.assert_array_equal(compiled.actuator_trnid[:, 0], np.arange(1, nu + 1))
 
@@ -117,7 +117,7 @@ def test_joints_that_are_held_come_after_those_that_the_policy_drives(held, coun
 
 def test_what_is_driven_is_not_held():
     r = robot.load(config.Robot(actuated="legs+waist", held="waist"))
-    assert len(r.joint_names) == len(r.rest_pose) == 15
+    assert r.num_joints == len(r.rest_pose) == 15
 
 
 @pytest.mark.parametrize("actuated", ["legs", "legs+waist"])

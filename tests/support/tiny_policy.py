@@ -16,7 +16,7 @@ from cref_jax.policy.manifest import build_manifest
 from cref_jax.training import pytree_digest
 
 ROBOT = robot.load(config.Robot())
-J = len(ROBOT.joint_names)
+J = ROBOT.num_joints
 OBS = observations.slices(J)["action"].stop
 SMALL = config.Network(
     convolutions=((4, 4, 4), (8, 3, 2)),
@@ -32,8 +32,8 @@ def policy(variant: config.Variant, net: config.Network = SMALL) -> trained.Trai
     sight = None
     if variant != "blind":
         zero = jnp.zeros((1, 1), jnp.int32)
-        sight = network.Sight(
-            network.in_patches(c.network, jnp.zeros((1, 1, *c.camera.shape))), zero, zero > 0
+        sight = network.DepthInput(
+            network.image_to_patches(c.network, jnp.zeros((1, 1, *c.camera.shape))), zero, zero > 0
         )
     key = jax.random.key(3)
     begins = jnp.zeros((1, 1), bool)
@@ -56,7 +56,7 @@ def contents(p: trained.TrainedPolicy) -> tuple[dict, dict[str, np.ndarray]]:
     return build_manifest(p, ROBOT), pytree_digest.on_host(p.train.params.actor["params"])
 
 
-def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.Recorded:
+def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.SensorLog:
     """Return random inputs that could be true: resets, and frames at no regular rate."""
     rng = np.random.default_rng(seed)
     draw = lambda *shape: rng.standard_normal(shape).astype(np.float32)
@@ -67,7 +67,7 @@ def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.
     fresh = rng.random(count) < 0.4
     image = rng.uniform(-0.5, 0.5, (count, 48, 64)).astype(np.float16)
     which = np.maximum.accumulate(np.where(fresh, np.arange(count), 0))
-    return reference_vectors.Recorded(
+    return reference_vectors.SensorLog(
         angular_velocity=draw(count, 3),
         gravity=gravity,
         command=rng.uniform([0, -0.3, -1], [1, 0.3, 1], (count, 3)).astype(np.float32),

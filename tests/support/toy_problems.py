@@ -95,14 +95,14 @@ def play(toy, state, networks, carry, key, horizon) -> ppo.Rollout:
         cue = jnp.where(begins[0], jax.random.rademacher(key_cue, (num_envs,), float), cue)
         obs = jax.vmap(toy.observe, (None, 0))(phase, cue)
         seen = critic_sees(phase, cue)
-        normal = ppo.normalise(state.statistics.obs, obs)
+        normal = ppo.normalize(state.statistics.obs, obs)
         memory, said = networks.actor(state.params.actor, memory, normal[None], begins)
         noise = jax.random.normal(key_action, said.mean[0].shape)
         action = said.mean[0] + jnp.exp(said.log_std) * noise
         reward = jax.vmap(toy.reward, (None, 0, 0))(phase, cue, action[:, 0])
         following = toy.advance(phase, cue, action[:, 0])
         value = lambda s: networks.critic(
-            state.params.critic, ppo.normalise(state.statistics.critic_obs, s)[None]
+            state.params.critic, ppo.normalize(state.statistics.critic_obs, s)[None]
         )[0]
         ended = jnp.full(num_envs, phase == toy.length - 1)
         emitted = ppo.Rollout(
@@ -133,8 +133,8 @@ def judge(toy, state, networks, carry) -> Outcome:
     phases = jnp.arange(toy.length)
     obs = jax.vmap(lambda t: jax.vmap(toy.observe, (None, 0))(t, CUES))(phases)
     begins = jnp.zeros((toy.length, 2), bool).at[0].set(True)
-    normal = ppo.normalise(state.statistics.obs, obs)
+    normal = ppo.normalize(state.statistics.obs, obs)
     _, said = networks.actor(state.params.actor, carry, normal, begins)
     seen = jax.vmap(lambda t: critic_sees(t, CUES))(phases)
-    value = networks.critic(state.params.critic, ppo.normalise(state.statistics.critic_obs, seen))
+    value = networks.critic(state.params.critic, ppo.normalize(state.statistics.critic_obs, seen))
     return Outcome(said.mean[..., 0], value)

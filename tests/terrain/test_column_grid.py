@@ -205,7 +205,7 @@ def test_a_tile_does_not_see_its_neighbours():
     grid = rng.uniform(-0.03, 0.03, (4 * SHAPE[0], 3 * SHAPE[1])).astype(np.float32)
     cut = lambda row, column: grid[row * 6 : row * 6 + 6, column * 5 : column * 5 + 5]
     lanes = [[cut(row, column) for column in range(3)] for row in range(4)]
-    whole = terrain.grid(lanes, CELL, ORIGIN, SHAPE)
+    whole = terrain.build_grid(lanes, CELL, ORIGIN, SHAPE)
     p = rng.uniform([-0.11, 0.24, -0.02], [0.13, 0.46, 0.04], (300, 3)).astype(np.float32)
     on_tile = jax.jit(lambda r, c, p: terrain.closest_point(terrain.tile(whole, r, c), p))
     for row, column in [(0, 0), (2, 1), (3, 2)]:
@@ -220,7 +220,7 @@ def test_one_column_across_is_the_same_ground_as_all_of_them():
     rng = np.random.default_rng(3)
     profile = rng.uniform(-0.03, 0.03, (70, 1)).astype(np.float32)
     full = terrain.from_heights(np.repeat(profile, 5, axis=1), CELL, ORIGIN)
-    thin = terrain.tile(terrain.grid([[profile]], CELL, ORIGIN, (70, 5)), 0, 0)
+    thin = terrain.tile(terrain.build_grid([[profile]], CELL, ORIGIN, (70, 5)), 0, 0)
     np.testing.assert_array_equal(thin.heights, full.heights)
     low, high = np.array([-0.2, 0.2, -0.02]), np.array([1.6, 0.5, 0.04])
     p = jnp.asarray(rng.uniform(low, high, (400, 3)), jnp.float32)
@@ -239,7 +239,7 @@ def test_one_column_across_is_the_same_ground_as_all_of_them():
 
 
 def test_robots_on_different_tiles_share_one_grid():
-    whole = terrain.grid(2 * [[np.zeros((6, 5), np.float32)]], CELL, ORIGIN, (6, 5))
+    whole = terrain.build_grid(2 * [[np.zeros((6, 5), np.float32)]], CELL, ORIGIN, (6, 5))
     tiled = lambda r, p: terrain.closest_point(terrain.tile(whole, r, 0), p)
     program = str(jax.make_jaxpr(jax.vmap(tiled))(jnp.arange(2), jnp.zeros((2, 3))))
     assert f"f32[{whole.tops.size}]" in program
@@ -267,7 +267,7 @@ def test_a_block_is_as_high_as_its_highest_column(shape):
 def test_a_tiles_blocks_hold_its_own_columns_and_no_others():
     heights = np.arange(60 * 60, dtype=np.float32).reshape(60, 60)
     lanes = [[heights[r : r + 20, c : c + 20] for c in (0, 20, 40)] for r in (0, 20, 40)]
-    ground = terrain.tile(terrain.grid(lanes, CELL, (0.0, 0.0), (20, 20)), 1, 2)
+    ground = terrain.tile(terrain.build_grid(lanes, CELL, (0.0, 0.0), (20, 20)), 1, 2)
     read = lambda level, i, j: float(terrain.block_top(ground, jnp.int32(i), jnp.int32(j), level))
     # column (5, 2) of the tile is (25, 42) of the grid; in the tile's blocks from (4, 0) and (0, 0)
     assert read(0, 5, 2) == 25 * 60 + 42

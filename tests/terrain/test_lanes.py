@@ -45,7 +45,7 @@ def runs(heights):
 
 
 def single(kind, size, **changes):
-    return profile(lanes.single(config.Terrain(**changes), kind, size))
+    return profile(lanes.build_single(config.Terrain(**changes), kind, size))
 
 
 def test_mixed_holds_every_kind_once(mixed):
@@ -199,7 +199,7 @@ def test_each_level_has_as_many_variants_as_are_asked_for():
 
 def test_a_grid_has_each_size_with_each_seed():
     c = config.Terrain()
-    atlas = lanes.grid(c, {"gap": (0.3, 0.5), "platform": (0.2, 0.4)}, [7, 8, 9])
+    atlas = lanes.build_grid(c, {"gap": (0.3, 0.5), "platform": (0.2, 0.4)}, [7, 8, 9])
     assert atlas.levels == 6 and atlas.kinds == ("gap", "platform")
     np.testing.assert_array_equal(atlas.sizes[:, 1], [0.2, 0.2, 0.2, 0.4, 0.4, 0.4])
     for level, (size, seed) in {1: (0.3, 8), 3: (0.5, 7), 5: (0.5, 9)}.items():
@@ -224,20 +224,20 @@ def test_a_slope_has_the_gradient_asked_for_up_and_down():
 
 
 def test_rough_ground_spans_the_height_asked_for_in_gentle_steps():
-    atlas = lanes.single(config.Terrain(), "rough", 0.06)
+    atlas = lanes.build_single(config.Terrain(), "rough", 0.06)
     heights = atlas.tile(0, 0).heights
     assert np.ptp(heights) == pytest.approx(0.06, abs=1e-6)
     assert abs(np.diff(heights, axis=0)).max() < 0.01
 
 
 def test_a_single_lane_has_exactly_the_size_asked_for():
-    atlas = lanes.single(config.Terrain(name="gap"), "stairs_up", 0.23)
+    atlas = lanes.build_single(config.Terrain(name="gap"), "stairs_up", 0.23)
     assert atlas.kinds == ("stairs_up",) and atlas.levels == 1
     assert atlas.sizes[0, 0] == 0.23
 
 
 def test_a_size_below_zero_is_refused():
-    refused("must not be below zero", lanes.single, config.Terrain(), "gap", -0.1)
+    refused("must not be below zero", lanes.build_single, config.Terrain(), "gap", -0.1)
 
 
 def test_evaluation_sizes_are_those_of_table_2():
@@ -301,7 +301,8 @@ def test_a_users_own_terrain_file_is_read(tmp_path):
     atlas = lanes.build(c)
     np.testing.assert_allclose(atlas.sizes[:, 0], [0.2, 0.3, 0.4])
     np.testing.assert_allclose(runs(profile(atlas, 2)), [(0, 2), (-0.3, 0.4), (0, 9.6)], atol=1e-6)
-    assert profile(lanes.single(c, "gap", 0.4)).min() == pytest.approx(-0.3)  # its own numbers
+    single = lanes.build_single(c, "gap", 0.4)
+    assert profile(single).min() == pytest.approx(-0.3)  # its own numbers
 
 
 # What is said about what cannot be used
@@ -316,12 +317,13 @@ def refused(message, call, *args):
 
 def test_an_unknown_terrain_is_met_with_the_nearest_name():
     known = "flat, flight, gap, mixed, platform, rough, slope, stairs"
-    message = f"unknown terrain 'gpa'; did you mean 'gap'? known: {known}"
-    refused(message, lanes.build, config.Terrain(name="gpa"))
+    near = "unknown terrain 'gpa'; did you mean 'gap'?"
+    refused(near, lanes.build, config.Terrain(name="gpa"))
+    refused(f"unknown terrain 'moon'; known: {known}", lanes.build, config.Terrain(name="moon"))
 
 
 def test_an_unknown_kind_is_met_with_the_nearest_name():
-    refused("did you mean 'stairs_up'?", lanes.single, config.Terrain(), "stairs_upp", 0.1)
+    refused("did you mean 'stairs_up'?", lanes.build_single, config.Terrain(), "stairs_upp", 0.1)
 
 
 GAP = 'kinds = ["gap"]\ntrain = [0.1, 0.2]\n[shape]\ncount = 1\ndepth = 1.0\nlanding = [2.0, 2.0]\n'
@@ -369,7 +371,7 @@ def test_a_mix_names_terrains_that_define_kinds(tmp_path):
 @pytest.mark.parametrize("kind", [k for k in TRAIN if k != "flat"])
 def test_a_lane_too_short_for_its_obstacles_is_refused(kind):
     c = config.Terrain(lane_length=3.4)
-    refused("lane_length is 3.4 m, but", lanes.single, c, kind, 0.2)
+    refused("lane_length is 3.4 m, but", lanes.build_single, c, kind, 0.2)
 
 
 def test_lanes_without_length_are_refused():

@@ -86,7 +86,7 @@ def rewrite_record(step: Path, **changes) -> None:
     """Change the record of a step and seal it again, as another program would have written it."""
     file = step / "meta" / "metadata"
     record = json.loads(file.read_text())["record"] | changes
-    file.write_text(json.dumps({"sha256": checkpoint._seal(record), "record": record}))
+    file.write_text(json.dumps({"sha256": checkpoint._record_digest(record), "record": record}))
 
 
 def test_every_leaf_comes_back_bit_for_bit(run):
@@ -104,7 +104,9 @@ def test_a_key_of_another_generator_comes_back_as_one(tmp_path):
         checkpoints.save(1, {"key": jax.random.key(7, impl="rbg")}, {})
         carry, _ = checkpoints.restore({"key": jax.random.key(0, impl="rbg")})
         assert jax.random.key_impl(carry["key"]) == "rbg"
-        with pytest.raises(CheckpointError, match=r"key is key<rbg>\[\] there, key<fry>\[\] here"):
+        with pytest.raises(
+            CheckpointError, match=r"key is key<rbg>\[\] on disk, key<fry>\[\] here"
+        ):
             checkpoints.restore({"key": jax.random.key(0)})
 
 
@@ -162,7 +164,10 @@ def test_saving_the_same_state_twice_writes_once(run):
 
 
 def test_a_fresh_run_does_not_write_into_an_old_one(run):
-    with Checkpoints(run) as checkpoints, pytest.raises(CheckpointError, match="holds step 3 of"):
+    with (
+        Checkpoints(run) as checkpoints,
+        pytest.raises(CheckpointError, match="contains step 3 of"),
+    ):
         checkpoints.save(1, state(), META)
     assert sorted(path.name for path in run.iterdir()) == ["1", "2", "3"]
 
@@ -180,7 +185,7 @@ def test_with_other_environments_only_the_learned_parts_come_back(run, caplog):
     fresh = state(99, num_envs=10)
     with Checkpoints(run) as checkpoints:
         with pytest.raises(
-            CheckpointError, match=r"3: env/key is key<fry>\[6\] there, .*\[10\] here"
+            CheckpointError, match=r"3: env/key is key<fry>\[6\] on disk, .*\[10\] here"
         ):
             checkpoints.restore(fresh)
         assert checkpoints.meta()["num_envs"] == 6
@@ -195,7 +200,7 @@ def test_a_part_that_the_state_lacks_is_named(run):
     with Checkpoints(run) as checkpoints:
         with pytest.raises(CheckpointError, match="no part 'parms'"):
             checkpoints.restore(state(), parts=("parms",))
-        with pytest.raises(CheckpointError, match="parms/actor/bias is absent there"):
+        with pytest.raises(CheckpointError, match="parms/actor/bias is absent on disk"):
             checkpoints.restore_part("parms", state().params)
 
 
@@ -206,23 +211,23 @@ def test_a_reader_takes_the_policy_alone_and_needs_only_its_shapes(run):
 
 
 def test_another_shape_is_named_with_both_sizes(run):
-    text = r"3: params/actor/bias is float32\[16\] there, float32\[32\] here \(and 5 more\)"
+    text = r"3: params/actor/bias is float32\[16\] on disk, float32\[32\] here \(and 5 more\)"
     with Checkpoints(run) as checkpoints, pytest.raises(CheckpointError, match=text):
         checkpoints.restore(state(width=32))
 
 
 def test_another_dtype_is_not_cast(run):
     half = state()._replace(iteration=jnp.array(0.0, jnp.float16))
-    text = r"3: iteration is int32\[\] there, float16\[\] here$"
+    text = r"3: iteration is int32\[\] on disk, float16\[\] here$"
     with Checkpoints(run) as checkpoints, pytest.raises(CheckpointError, match=text):
         checkpoints.restore(half)
 
 
 def test_a_leaf_too_many_is_named(run):
     with Checkpoints(run) as checkpoints:
-        with pytest.raises(CheckpointError, match=r"nothing is absent there, float32\[\] here"):
+        with pytest.raises(CheckpointError, match=r"nothing is absent on disk, float32\[\] here"):
             checkpoints.restore(state()._replace(nothing=jnp.zeros(())))
-        with pytest.raises(CheckpointError, match=r"key is key<fry>\[\] there, absent here"):
+        with pytest.raises(CheckpointError, match=r"key is key<fry>\[\] on disk, absent here"):
             checkpoints.restore(state()._replace(key=None))
 
 
@@ -312,7 +317,7 @@ def test_a_numbered_directory_of_someone_else_is_left_alone(run, content, caplog
             checkpoints.save(step, state(step), META)
         assert checkpoints.steps() == [5, 6, 7]
     assert (run / "9").exists()
-    assert caplog.text.count("9 is no checkpoint; skipped") == 1
+    assert caplog.text.count("9 is not a checkpoint; skipped") == 1
 
 
 def test_a_numbered_directory_in_the_way_is_set_aside(tmp_path):
@@ -326,7 +331,7 @@ def test_a_numbered_directory_in_the_way_is_set_aside(tmp_path):
 
 def test_a_newer_schema_is_refused(run):
     rewrite_record(run / "3", schema=checkpoint.SCHEMA + 1)
-    text = r"run/3: written by a newer program \(schema 2, this one knows 1\)"
+    text = r"run/3: written by a newer program \(schema 2, this one reads 1\)"
     with Checkpoints(run) as checkpoints, pytest.raises(CheckpointError, match=text):
         checkpoints.restore(state(99), allow_fallback=True)
 
@@ -429,7 +434,7 @@ with checkpoint.lock(sys.argv[1]):
 
 def test_the_lock_of_another_host_is_left_alone(tmp_path):
     (tmp_path / "run.lock").write_text("17 elsewhere\n")
-    with pytest.raises(CheckpointError, match=r"process 17 on elsewhere; if that is dead, remove"):
+    with pytest.raises(CheckpointError, match=r"process 17 on elsewhere; if it is dead, remove"):
         checkpoint.lock(tmp_path).__enter__()
 
 

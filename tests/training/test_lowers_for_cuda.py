@@ -30,7 +30,7 @@ MOST = {"while": 18, "case": 6, "sort": 7, "triangular_solve": 4, "operations": 
 def traced() -> jax.stages.Traced:
     c = presets.build_config("mixed", None, "gpu")
     c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=ROBOTS))
-    return gpu_program.traced(c, "mjx", iteration.mesh_of())
+    return gpu_program.trace_iteration(c, "mjx", iteration.make_mesh())
 
 
 @functools.cache

@@ -18,7 +18,7 @@ SIGNS = (1, -1, -1, 1, 1, -1)
 
 @pytest.fixture
 def joints(world):
-    return mirror.joints(world.physics.model)
+    return mirror.pair_joints(world.physics.model)
 
 
 def test_legs_change_places_and_rolls_and_yaws_their_sign(world, joints):
@@ -32,7 +32,7 @@ def test_legs_change_places_and_rolls_and_yaws_their_sign(world, joints):
 
 def test_a_mirror_image_of_a_mirror_image_is_the_thing_itself(world, robots, joints):
     for values in (robots.body.qpos[:, 7:], robots.body.qvel[:, 6:]):
-        np.testing.assert_array_equal(joints.flipped(joints.flipped(values)), values)
+        np.testing.assert_array_equal(joints.flip(joints.flip(values)), values)
     twice = jax.vmap(lambda b: mirror.body(mirror.body(b, joints), joints))(robots.body)
     jax.tree.map(np.testing.assert_array_equal, twice, robots.body)
     seen = jax.random.normal(jax.random.key(0), (5, 45))
@@ -43,7 +43,7 @@ def test_a_mirror_image_of_a_mirror_image_is_the_thing_itself(world, robots, joi
 def test_an_image_is_turned_over(world):
     image = jax.random.uniform(jax.random.key(1), (2, 48, 64)).astype(jnp.float16)
     c = C.network
-    found = network.as_image(c, mirror.frame(network.in_patches(c, image), c))
+    found = network.patches_to_image(c, mirror.frame(network.image_to_patches(c, image), c))
     np.testing.assert_array_equal(found, image[..., ::-1])
 
 
@@ -53,7 +53,7 @@ def test_a_model_with_one_leg_more_is_refused(world):
         <body><joint name="left_knee_joint" axis="0 1 0"/><geom size=".1"/></body>
       </body></worldbody></mujoco>""")
     with pytest.raises(ValueError, match="no right_knee_joint"):
-        mirror.joints(lame)
+        mirror.pair_joints(lame)
 
 
 def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
@@ -83,7 +83,7 @@ def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
     for _ in range(3):
         action = jnp.asarray(0.5 * rng.normal(size=state.action.shape), jnp.float32)
         state, real = step(world, state, action)
-        image, imagined = step(world, image, joints.flipped(action))
+        image, imagined = step(world, image, joints.flip(action))
         there, here = real.observation, imagined.observation
         np.testing.assert_allclose(
             here.proprioception, mirror.proprioception(there.proprioception, joints), atol=2e-3
@@ -119,8 +119,8 @@ def symmetric():
 
 def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
     world, state = symmetric
-    of = mirror.of(world.physics.model, world.config.network)
-    nets = rollout.networks(world.config.network, len(world.physics.robot.joint_names))
+    of = mirror.make_mirror(world.physics.model, world.config.network)
+    nets = rollout.networks(world.config.network, world.physics.robot.num_joints)
     act = jax.jit(lambda nets, r: rollout.policy_step(nets, state.train, r), static_argnums=0)
     keys = iter(jax.random.split(jax.random.key(5), 9))
     noise = lambda x: jax.random.uniform(next(keys), x.shape, x.dtype)
@@ -143,7 +143,7 @@ def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
 
 def test_training_remembers_what_the_twin_has_seen(symmetric):
     world, state = symmetric
-    after, log = iteration.chunk(world, state, iteration.mesh_of(), 2)
+    after, log = iteration.chunk(world, state, iteration.make_mesh(), 2)
     assert (log["loss/asymmetry"] > 0.0).all()
     twin, own = after.robots.memory.twin, after.robots.memory
     assert not np.allclose(twin.carry.gru, own.carry.gru)

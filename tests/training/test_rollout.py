@@ -43,7 +43,7 @@ def two_horizons(variant: str):
     world = small_world.world().replace(config=small(variant))
     c = world.config
     state = jax.jit(iteration.initial_state)(world)
-    nets = rollout.networks(c.network, len(world.physics.robot.joint_names))
+    nets = rollout.networks(c.network, world.physics.robot.num_joints)
     collect = jax.jit(lambda w, r, k: rollout.collect(w, nets, state.train, r, k))
     middle, first, _ = collect(world, state.robots, jax.random.key(1))
     last, second, _ = collect(world, middle, jax.random.key(2))
@@ -61,12 +61,12 @@ def test_the_update_recomputes_the_actions_that_were_taken(seeing):
     for r in horizons:
         assert r.begins[1:].any(), "an episode must begin inside of the horizon"
         assert not r.sight.seen.all() and r.sight.seen.any()
-        obs = ppo.normalise(train.statistics.obs, r.obs)
+        obs = ppo.normalize(train.statistics.obs, r.obs)
         _, out = actor(train.params.actor, r.carry, obs, r.begins, r.sight)
         np.testing.assert_allclose(out.mean, r.mean, atol=1e-6)
 
 
-def test_frames_come_at_20_hz_and_each_is_in_the_album_once(seeing):
+def test_frames_come_at_20_hz_and_each_is_stored_once(seeing):
     world, _, _, robots, horizons = seeing
     steps = np.concatenate([np.asarray(r.sight.held[:, 0]) for r in horizons])
     # 12 steps are 0.24 s; with 20 frames a second a step in 2.5 brings one: after steps 3, 5, 8, 10

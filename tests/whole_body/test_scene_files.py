@@ -18,7 +18,7 @@ from cref_jax.whole_body.simulator import WholeBodySim
 from cref_jax.whole_body.trial import Start, _initial_state, run_trial
 
 C = protocol.evaluation_config(Config())
-SCENES = scene_files.scenes()
+SCENES = scene_files.load_all()
 HEAD = 'title = "a scene"\nend = 6.0\nwidth = 1.4\n'
 STANDING = Start(
     np.array([0.7, 0.0, ROBOT.standing_height, 1.0, 0.0, 0.0, 0.0]), ROBOT.nominal_pose, 0.5
@@ -198,16 +198,16 @@ BOX = "[[box]]\nx = [2.0, 2.5]\ny = [-0.5, 0.5]\nz = [0.0, 0.1]\n"
     [
         ("heigth = 3.0\n", "unknown setting 'mine.toml: heigth'"),
         (BOX + 'lok = "wood"\n', "did you mean 'look'"),
-        (BOX.replace("[2.0, 2.5]", "[2.5, 2.0]"), "box 1: x must be [from, to], rising"),
+        (BOX.replace("[2.0, 2.5]", "[2.5, 2.0]"), "box 1: x must be [from, to], ascending"),
         (BOX.replace("0.1]", "inf]"), "finite"),
         (BOX.replace("z = [0.0, 0.1]\n", ""), "box 1: 'z' is missing"),
-        (BOX + "count = [2]\n", "count and by must be as many"),
-        (BOX + "count = [0]\nby = [[1.0, 0.0, 0.0]]\n", "each count at least 1"),
+        (BOX + "count = [2]\n", "count and by must have equal length"),
+        (BOX + "count = [0]\nby = [[1.0, 0.0, 0.0]]\n", "each count be at least 1"),
         (BOX + "count = [90000]\nby = [[1.0, 0.0, 0.0]]\n", "more than 3000"),
         (BOX + 'look = "gold"\n', "must be one of 'concrete'"),
         ("box = [3]\n", "must be dict"),
         ("[[cylinder]]\nends = [[2, 0, 0], [2, 0, 1]]\nradius = -0.1\n", "radius must be above"),
-        ("[[cylinder]]\nends = [[2, 0, 0], [2, 0, 0]]\nradius = 0.1\n", "ends must be apart"),
+        ("[[cylinder]]\nends = [[2, 0, 0], [2, 0, 0]]\nradius = 0.1\n", "ends must differ"),
         ('[[place]]\npart = "wal"\nat = [2, 0, 0]\n[part.wall]\n', "did you mean 'wall'"),
         ("ditches = [[3.0, 2.0]]\n", "ditches must be"),
         ("part = 3\n", "must be dict"),
@@ -229,7 +229,7 @@ def test_a_scene_has_an_end_and_a_width(scene):
 
 def test_an_unknown_scene_is_one_line():
     with pytest.raises(ConfigError, match="did you mean 'steel_grate'"):
-        scene_files.named("steel_grates")
+        scene_files.load_named("steel_grates")
 
 
 @pytest.mark.parametrize("mu", [0.4, 0.9, 1.0])
@@ -281,7 +281,7 @@ def test_a_foot_stands_across_slots_that_its_spheres_would_sink_into(scene):
 
 def judged(body, state):
     """Return how a trial that begins at the nominal pose ends in this state."""
-    return termination.TerminationChecker(body, placed(body)).ending(state, body.foot_force(state))
+    return termination.TerminationChecker(body, placed(body)).check(state, body.foot_force(state))
 
 
 def rail(y):
@@ -330,8 +330,8 @@ def test_a_trial_in_a_scene_ends_at_its_end_or_beside_it(scene, changes, ending)
 def test_who_does_not_come_forward_stalls_after_ten_seconds(scene):
     body = on(scene(""))
     state = placed(body)
-    judge = termination.TerminationChecker(body, state, speed=0.5)
-    endings = [judge.ending(state, body.foot_force(state)) for _ in range(501)]
+    checker = termination.TerminationChecker(body, state, speed=0.5)
+    endings = [checker.check(state, body.foot_force(state)) for _ in range(501)]
     assert endings.index("stalled") == 499  # 500 control steps after the first state
 
 

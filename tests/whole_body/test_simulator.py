@@ -58,7 +58,7 @@ def gap_world():
 
 def test_it_sees_what_the_robot_sees_in_training():
     world = gap_world()
-    body = on_lane(sim2sim.lane_of(world))
+    body = on_lane(sim2sim.to_lane(world))
     heights = robot_scene.window(world.lanes.tile(0, 0))[0]
     edge = 0.02 * int(np.argmin(heights[:, 100] > -0.5))  # m, where the first gap begins
     turned = np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)], np.float32)
@@ -128,9 +128,9 @@ def test_a_foot_relieved_for_a_moment_still_bears(body):
     state.xpos[body.feet, 2] = [0.51, 0.07]
     state.qpos[2] = 0.64
     landing, bearing = [0.0, 0.0, 400.0], [0.0, 0.0, 300.0]
-    judge = termination.TerminationChecker(body, state)
-    assert judge.ending(state, np.array([landing, bearing])) is None
-    assert judge.ending(state, np.array([landing, [0.0, 0.0, 0.0]])) == "low"
+    checker = termination.TerminationChecker(body, state)
+    assert checker.check(state, np.array([landing, bearing])) is None
+    assert checker.check(state, np.array([landing, [0.0, 0.0, 0.0]])) == "low"
 
 
 @pytest.mark.parametrize(
@@ -144,20 +144,20 @@ def test_a_foot_relieved_for_a_moment_still_bears(body):
     ],
 )
 def test_a_trial_ends_as_an_episode_does(body, changes, ending):
-    judge = termination.TerminationChecker(body, placed(body))
+    checker = termination.TerminationChecker(body, placed(body))
     state = placed(body, **changes)
     if ending == "unstable":
         mujoco.mj_step(body.model, state)
-    assert judge.ending(state, body.foot_force(state)) == ending
+    assert checker.check(state, body.foot_force(state)) == ending
 
 
 def test_a_foot_far_below_the_last_support_has_dropped():
     heights = np.zeros((600, 200), np.float32)
     heights[60:] = -1.0
     body = on_lane(Lane(heights, FLAT.origin, FLAT.cell, FLAT.end))
-    judge = termination.TerminationChecker(body, placed(body))
-    judge._support += 0.6
-    assert judge.ending(placed(body, x=5.0), np.zeros((2, 3))) in ("low", "dropped")
+    checker = termination.TerminationChecker(body, placed(body))
+    checker._support += 0.6
+    assert checker.check(placed(body, x=5.0), np.zeros((2, 3))) in ("low", "dropped")
 
 
 def test_upper_body_on_the_ground_is_a_hit(body):
