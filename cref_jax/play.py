@@ -44,13 +44,13 @@ WIDTH, HEIGHT = 960, 540  # pixels of the video
 STILL_WIDTH = 480  # pixels of one still; its height is HEIGHT
 MAX_SECONDS = 600.0
 
-ENDINGS = {  # of an episode, by its name in episode.Ending
+ENDINGS = {  # of an episode, by its name in state.Ending
     "tilted": "fell, tilted too far",
     "low": "fell, its pelvis too low",
     "hit": "fell, its upper body on the ground",
-    "dropped": "stepped into the depth",
+    "dropped": "stepped far below its support",
     "unstable": "blew up in the simulation",
-    "stalled": "stood still for too long",
+    "stalled": "stalled",
     "finished": "came to the end of the lane",
     "timeout": "ran out of time",
 }

@@ -46,7 +46,6 @@ from cref_jax.evaluation.recorder import Moment, StepRecords
 from cref_jax.system import jax_setup
 from cref_jax.terrain import cross_section
 
-EDGE = 0.03  # m off the plane of the neighbours; assumed: above rounding and 2 cm slope columns
 AHEAD = 1.5  # m before an obstacle where its terrain begins; most of the camera's range
 MOMENTS = (-0.9, -0.5, -0.2, 0.1, 0.5)  # m from the edge to the pelvis
 FOLLOWED = 8  # robots whose images are kept, one of which is drawn

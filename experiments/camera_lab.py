@@ -5,20 +5,20 @@ on the ground. The policy is run on scenes full of such holes, different from th
 ood`, with each pixel replaced by the nearest of 1 x 1, 3 x 3 and 5 x 5 pixels.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 import json
 import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
+
 from cref_jax import deploy
 from cref_jax.evaluation import scene_suite
 from cref_jax.policy import sources
 from cref_jax.whole_body import scene_files
-
-# isort: split
-
-import tyro
 
 SCENES = Path(__file__).parent / "holes"
 

@@ -4,18 +4,18 @@ Each is shown with the robot standing in the nominal pose, beside the image of i
 pixels without a return are drawn at the far plane. Takes seconds.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 from dataclasses import dataclass
 from pathlib import Path
+
+import matplotlib
 
 from cref_jax import config, robot
 from cref_jax.config import Config
 from cref_jax.rendering import robot_scene, video
 from cref_jax.whole_body import ground, scene_files
 from cref_jax.whole_body.simulator import WholeBodySim
-
-# isort: split
-
-import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

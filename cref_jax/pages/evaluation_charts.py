@@ -18,11 +18,22 @@ CAUSES = {  # display name of each failure cause in a record
     "hit": "upper body on the ground",
     "dropped": "foot far below its support",
     "unstable": "simulation blew up",
+    "strayed": "off the path",
     "stalled": "stalled",
     "late": "too late",
     "timeout": "ran out of time",
 }
-CAUSE_COLOURS = ("#b5432a", "#e58f3c", "#f2cf63", "#35618f", "#8a8f98", "#7fb3a3", "#a98bbd")
+CAUSE_COLOURS = (
+    "#b5432a",
+    "#e58f3c",
+    "#f2cf63",
+    "#35618f",
+    "#8a8f98",
+    "#7fb3a3",
+    "#a98bbd",
+    "#5b8c5a",
+    "#c27ba0",
+)
 LEVEL_COLOURS = ("#7ab8d9", "#3a86b5", "#1d4e80", "#b5432a")
 OURS, THEIRS = "#1d4e80", "#b5432a"
 
