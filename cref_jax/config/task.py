@@ -105,6 +105,10 @@ class Randomisation:
     noise_joint_velocity: float = 1.5  # rad/s, +-
     camera_pitch: float = 2.0  # deg, +-, how the camera is mounted
     camera_position: float = 0.01  # m, +-, each axis
+    structures: int = 0
+    """Capsules per episode in the depth image alone: rails, walls, posts and bars beside and over
+    the lane"""
+    push_yaw_rate: float = 0.0  # rad/s, up to, with each push, as of a wrist that meets a rail
     ramp: bool = False  # begin with none of it, and let it grow with competence
     ramp_falls: tuple[float, float] = (2.5, 4.0)  # per minute: fewer raise, more lower; assumed
     ramp_step: float = 0.005  # of all ranges, per iteration; assumed

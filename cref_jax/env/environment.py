@@ -21,6 +21,7 @@ from cref_jax.env import (
     observations,
     resets,
     rewards,
+    structures,
     terminations,
 )
 from cref_jax.env.footholds import Soles
@@ -195,7 +196,7 @@ def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Floa
 def render_depth(
     world: World, state: EnvState, is_profile: bool = False, with_links: bool = True
 ) -> Float[Array, "H W"]:
-    """Render the depth of the ground and, if wanted, of the robot's own links, m.
+    """Render the depth of the ground and, if wanted, of the robot's own links and structures, m.
 
     `is_profile` says that the robot's lane is level across: see depth.render.
     """
@@ -205,6 +206,9 @@ def render_depth(
         links, robot.camera, camera, state.camera_pitch, state.camera_shift
     )
     capsules = depth.capsules_in_view(links, robot.capsules) if with_links else jnp.zeros((0, 7))
+    randomisation = world.config.randomisation
+    if with_links and randomisation.enabled and randomisation.structures:
+        capsules = jnp.concatenate([capsules, structures.sample_structures(world, state)])
     ground = _ground(world, state)
     return depth.render(ground, position, rotation, capsules, camera, is_profile)
 

@@ -18,11 +18,13 @@ def is_draw_due(world: World, state: EnvState) -> Bool[Array, ""]:
 def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRNGKeyArray) -> Draws:
     """Draw the next push and the next command, used where they are due."""
     c = world.config
-    (key_shove, key_after), most = jax.random.split(key_push), c.randomisation.push_velocity
+    most, turn = c.randomisation.push_velocity, c.randomisation.push_yaw_rate
+    key_shove, key_after = jax.random.split(key_push)
     key_next, key_left = jax.random.split(key_command)
     command, is_steered = commands.sample_command(world, key_next, state.kind)
     return Draws(
         shove=jax.random.uniform(key_shove, (2,), minval=-most, maxval=most),
+        turn=jax.random.uniform(jax.random.fold_in(key_shove, 0), minval=-turn, maxval=turn),
         push_left=randomization.sample_steps(c, key_after, c.randomisation.push_period),
         command=command,
         is_steered=is_steered,
@@ -31,11 +33,14 @@ def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRN
 
 
 def apply_push(world: World, state: EnvState, draws: Draws) -> EnvState:
-    """Add a sudden planar velocity to the base when a push is due."""
+    """Add a sudden planar velocity, and a turn, to the base when a push is due."""
     if not world.config.randomisation.enabled:
         return state
     due = state.push_left <= 0
-    qvel = state.body.qvel.at[:2].add(jnp.where(due, state.spread.pushes * draws.shove, 0.0))
+    share = jnp.where(due, state.spread.pushes, 0.0)
+    qvel = state.body.qvel.at[:2].add(share * draws.shove)
+    if world.config.randomisation.push_yaw_rate > 0.0:
+        qvel = qvel.at[5].add(share * draws.turn)
     return state.replace(
         body=state.body._replace(qvel=qvel),
         push_left=jnp.where(due, draws.push_left, state.push_left - 1),

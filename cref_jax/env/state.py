@@ -91,6 +91,7 @@ class Draws(NamedTuple):
     """The next push and the next command, and the control steps until those after them."""
 
     shove: Float[Array, "2"]  # m/s
+    turn: Float[Array, ""]  # rad/s, about the body's z
     push_left: Int[Array, ""]
     command: Float[Array, "3"]  # m/s, m/s, rad/s
     is_steered: Bool[Array, ""]

@@ -154,9 +154,22 @@ def test_each_part_is_randomised_alone(world, part):
     shoved = jax.vmap(events.apply_push, in_axes=(None, 0, None))
     due, draw = state.replace(push_left=jnp.zeros(32, jnp.int32)), jnp.array([0.5, -0.3])
     none = jnp.int32(0)
-    draws = Draws(draw, none, jnp.zeros(3), jnp.array(False), none)
+    draws = Draws(draw, jnp.float32(0.7), none, jnp.zeros(3), jnp.array(False), none)
     gained = shoved(world, due, draws).body.qvel - state.body.qvel
     np.testing.assert_allclose(gained[:, :2], jnp.tile(draw * (part == "pushes"), (32, 1)))
+    np.testing.assert_array_equal(gained[:, 5], 0.0)  # the default turns nobody
+
+
+def test_a_push_turns_the_base_where_it_is_asked_to(world, fresh_states):
+    c = config.override(C, {"randomisation": {"push_yaw_rate": 1.5}})
+    state = jax.tree.map(lambda x: x[:64], fresh_states)
+    state = state.replace(push_left=jnp.zeros(64, jnp.int32))
+    world = world.replace(config=c)
+    push = lambda s, k: events.apply_push(world, s, events.draw(world, s, k, k))
+    after = jax.vmap(push)(state, jax.random.split(jax.random.key(1), 64))
+    turn = np.asarray(after.body.qvel - state.body.qvel)[:, 5]
+    assert 1.0 < turn.max() <= 1.5 and -1.5 <= turn.min() < -1.0
+    assert np.abs(np.corrcoef(turn, np.asarray(after.body.qvel)[:, 0])[0, 1]) < 0.4
 
 
 # The command
