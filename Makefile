@@ -11,6 +11,9 @@ TERRAIN ?= gap
 EXP ?=
 ARGS ?=
 
+# a resumed run keeps its terrain, unless another one is asked for by name: that is an error
+TERRAIN_OPTION = $(if $(and $(findstring --resume,$(ARGS)),$(filter file,$(origin TERRAIN))),,--terrain $(TERRAIN))
+
 .PHONY: help $(shell sed -n "s/^\([a-z0-9-]*\):.*\#\# .*/\1/p" Makefile)
 
 help:
@@ -19,7 +22,7 @@ help:
 setup: $(READY)  ## make .venv and install everything, with CUDA where a GPU answers
 
 train: $(READY)  ## train a policy: TERRAIN=gap EXP=full ARGS="--num-envs 4096"
-	$(BIN)/python -m cref_jax.train --terrain $(TERRAIN) $(if $(EXP),--experiment $(EXP)) $(ARGS)
+	$(BIN)/python -m cref_jax.train $(TERRAIN_OPTION) $(if $(EXP),--experiment $(EXP)) $(ARGS)
 
 eval: $(READY)  ## measure success rates: ARGS="--run runs/NAME --suite table"
 	$(BIN)/python -m cref_jax.eval $(ARGS)

@@ -6,6 +6,8 @@ roofline bound over its time: the bound is that of its matrix products at the ra
 of its arrays at the rate of a copy. The bound of the physics is MuJoCo's own batch.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 import functools
 import json
 import os

@@ -42,6 +42,9 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1 if isinstance(error, TrainingError) else 2)
     except KeyboardInterrupt:
+        program = getattr(sys.modules["__main__"], "__spec__", None)
+        if program is None or not program.name.startswith("cref_jax."):
+            raise  # called by a notebook or a script, which goes on
         print("interrupted", file=sys.stderr)
         sys.stdout.flush()
         os._exit(130)  # at once: a running XLA program may still call into this interpreter

@@ -7,6 +7,8 @@ allocated: world and state are shapes. This needs the packages of the CUDA plugi
 estimate is a bound from the card's bandwidth, its FLOP rate and the launches, not a measurement.
 """
 
+import cref_jax.system.startup  # noqa: F401
+
 import collections
 import dataclasses
 import importlib.util

@@ -1,5 +1,7 @@
 """Count the parameters of each variant of the network: `python -m cref_jax.params`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 import typing
 from dataclasses import dataclass
 

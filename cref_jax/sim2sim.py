@@ -68,10 +68,14 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare()
         if options.trials < 1:
             raise ConfigError(f"--trials must be at least 1, not {options.trials}")
-        if options.film and options.film.suffix != ".mp4":
-            raise ConfigError(f"--film must end in .mp4: {options.film}")
+        if not options.latency >= 0.0:
+            raise ConfigError(f"--latency must not be below 0 s: {options.latency}")
         if options.film and options.table:
             raise ConfigError("--film goes with one --kind, not with --table")
+        if options.film:
+            cli.prepare_output(options.film, ".mp4", "--film")
+        if options.out:
+            cli.prepare_output(options.out, ".json")
         path = sources.find_policy(options.policy or sources.bundled_policy())
         policy = reader.read(path)
         physics = build_world(policy.config, "mujoco").physics

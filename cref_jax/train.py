@@ -1,5 +1,7 @@
 """Train a policy: `python -m cref_jax.train --terrain gap`."""
 
+import cref_jax.system.startup  # noqa: F401
+
 import dataclasses
 import datetime
 import json
@@ -104,8 +106,9 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     options = dataclasses.replace(options, device=select_device(options.device))
     if options.resume:
         run = options.run_dir or run_dir.newest()
-        options = dataclasses.replace(options, run_dir=run)
         base = run_dir.read_config(run)
+        _check_resumed(run, base, options, arguments)
+        options = dataclasses.replace(options, run_dir=run)
     else:
         base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
@@ -117,6 +120,23 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         c = _with_init(c, options)
     limits.check(c)
     return options, c
+
+
+def _check_resumed(run: Path, base: Config, options: Options, arguments: list[str]) -> None:
+    """Refuse a terrain or an experiment that a resumed run does not have.
+
+    Raises:
+        ConfigError: says what the run has.
+    """
+    asked = {a.partition("=")[0] for a in arguments}
+    its_own = {"terrain": base.terrain.name, "experiment": run_dir.first_option(run, "experiment")}
+    for name, own in its_own.items():
+        other = getattr(options, name)
+        if f"--{name}" in asked and own is not None and other != own:
+            raise ConfigError(
+                f"{run} was begun with {name} '{own}', not '{other}'; to go on with another, begin "
+                f"a new run with --init {run}"
+            )
 
 
 def _options(arguments: list[str]) -> Options:
@@ -263,7 +283,9 @@ def _has_critic(init: Path, c: Config) -> bool:
 
 def _name(options: Options) -> str:
     """Return the name of a new run."""
-    parts = [Path(options.terrain).stem, *([options.experiment] if options.experiment else [])]
+    parts = [Path(options.terrain).stem]
+    parts += [Path(options.experiment).stem] if options.experiment else []
+    parts += [f"seed{options.seed}"] if options.seed is not None else []  # jobs of one second
     return "-".join([*parts, datetime.datetime.now().strftime("%Y%m%d-%H%M%S")])
 
 

@@ -25,10 +25,11 @@ import pytest
 def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_num_cpu_devices", 2)  # what is shared among devices, is among these
     # The cache is the user's own: it holds machine code.
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cref_jax" / "tests"
     try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        cache = Path(home) / "cref_jax" / "tests"
         cache.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError:
+    except (OSError, RuntimeError):
         cache = Path(tempfile.mkdtemp(prefix="cref_jax-"))
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

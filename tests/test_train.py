@@ -14,6 +14,7 @@ import pytest
 
 from cref_jax import config, export, train
 from cref_jax.env.world import build_world
+from cref_jax.errors import ConfigError
 from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.training import devices, iteration, run_dir
 from cref_jax.training.checkpoint import Checkpoints
@@ -33,6 +34,28 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "first"
     run(folder)
     return folder
+
+
+def test_runs_of_several_seeds_begun_in_one_second_have_names_of_their_own():
+    named = lambda seed: train._name(train.Options(terrain="my/map.npy", seed=seed))
+    assert len({named(seed) for seed in (0, 1, 2)}) == 3
+    assert named(3).startswith("map-seed3-")
+
+
+def test_a_resumed_run_keeps_its_terrain_and_its_experiment(first, tmp_path):
+    resume = ["--resume", "--run-dir", str(first)]
+    _, c = train.parse([*resume, "--terrain", "flat"])
+    assert c.terrain.name == "flat"
+    with pytest.raises(ConfigError, match=f"terrain 'flat', not 'gap'; .* --init {first}"):
+        train.parse([*resume, "--terrain", "gap"])
+    copy = tmp_path / "copy"
+    shutil.copytree(first, copy)
+    origin = json.dumps({"command": ["train.py", "--experiment", "smoke"]})
+    (copy / "origin.jsonl").write_text(origin + "\n")
+    resume = ["--resume", "--run-dir", str(copy)]
+    train.parse([*resume, "--experiment", "smoke"])
+    with pytest.raises(ConfigError, match="experiment 'smoke', not 'full'"):
+        train.parse([*resume, "--experiment=full"])
 
 
 def state_of(folder: Path) -> list[np.ndarray]:

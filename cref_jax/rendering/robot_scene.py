@@ -14,6 +14,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.geoms import GROUND, TILE, TONES, Boxes
 from cref_jax.rendering.video import Frame
 from cref_jax.robot.registry import describe
+from cref_jax.system import startup
 from cref_jax.terrain import Terrain
 
 MOST_VERTICES = 1_000_000  # of a height field; more render too slowly on a CPU
@@ -88,8 +89,10 @@ class Canvas:
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # the types depend on the backend
+            asked = startup.missing_opengl
             raise ConfigError(
-                "rendering needs OpenGL; on Debian and Ubuntu: "
+                (f"MUJOCO_GL={asked}, which is not installed: " if asked else "")
+                + "rendering needs OpenGL; on Debian and Ubuntu: "
                 "apt install libegl1 libosmesa6 libgl1; if DISPLAY is set without a display: "
                 "MUJOCO_GL=egl"
             ) from error

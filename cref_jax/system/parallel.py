@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
+import loky
 from rich.progress import track
 
 J = TypeVar("J")
@@ -21,9 +22,8 @@ R = TypeVar("R")
 
 
 def cores() -> int:
-    """Count the cores available to this process; macOS does not limit them."""
-    limited = hasattr(os, "sched_getaffinity")
-    return len(os.sched_getaffinity(0)) if limited else os.cpu_count() or 1
+    """Count the cores available to this process, by affinity and by its container's quota."""
+    return loky.cpu_count()
 
 
 def run(

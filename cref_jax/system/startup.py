@@ -13,6 +13,14 @@ if "numpy" not in sys.modules:  # a policy's small products are ten times slower
     for _name in THREADS:
         os.environ.setdefault(_name, "1")
 
-if sys.platform == "linux" and not (os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
-    _gl = [name for name, file in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(file)]
-    os.environ.setdefault("MUJOCO_GL", _gl[0] if _gl else "off")
+OPENGL = {"egl": "EGL", "osmesa": "OSMesa"}  # library of each way to render without a display
+missing_opengl = ""  # what MUJOCO_GL asked for and this machine lacks: importing mujoco would fail
+
+if sys.platform == "linux":
+    _asked = os.environ.get("MUJOCO_GL", "").lower()
+    if _asked in OPENGL and not find_library(OPENGL[_asked]):
+        missing_opengl = _asked
+        os.environ["MUJOCO_GL"] = "off"
+    elif not (_asked or os.getenv("DISPLAY") or os.getenv("WAYLAND_DISPLAY")):
+        _there = [name for name, library in OPENGL.items() if find_library(library)]
+        os.environ["MUJOCO_GL"] = _there[0] if _there else "off"

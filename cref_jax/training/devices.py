@@ -1,6 +1,8 @@
 """Devices that the environments are sharded over, and their memory."""
 
+import contextlib
 import os
+from pathlib import Path
 
 import jax
 from jax.sharding import Mesh
@@ -8,6 +10,11 @@ from jax.sharding import Mesh
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.training import iteration
+
+CONTAINER_LIMITS = (  # files of cgroup v2 and v1
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
 
 
 def choose_mesh(c: Config, requested: int | None = None) -> Mesh:
@@ -52,5 +59,9 @@ def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) 
 
 
 def _main_memory() -> int:
-    """Read the size of the machine's memory, bytes."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Read the memory that this process may use, bytes: the machine's, or its container's."""
+    sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for file in CONTAINER_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # no container, or `max`
+            sizes.append(int(Path(file).read_text()))
+    return min(sizes)

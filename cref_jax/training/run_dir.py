@@ -82,6 +82,20 @@ def read_config(run: Path) -> Config:
         raise ConfigError(f"{path}: {error}") from None
 
 
+def first_option(run: Path, name: str) -> str | None:
+    """Read an option from the command line that began a run, None if it was not given."""
+    try:
+        command = json.loads((run / "origin.jsonl").read_text().splitlines()[0])["command"]
+    except (OSError, ValueError, IndexError, KeyError):
+        return None
+    for word, following in zip(command, [*command[1:], ""], strict=True):
+        if word == f"--{name}":
+            return following
+        if word.startswith(f"--{name}="):
+            return word.partition("=")[2]
+    return None
+
+
 def newest(root: Path = ROOT) -> Path:
     """Find the run with the newest checkpoint.
 

@@ -60,6 +60,30 @@ def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
     limits.check(Config())
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"camera": {"shape": [58, 88]}}, "'camera.shape': 58 rows do not split .* take 56"),
+        ({"camera": {"shape": [48, 87]}}, "87 columns do not split .* take 88"),
+        ({"network": {"heads": 3}}, "'network.token', 128, does not split into 3 heads"),
+        ({"network": {"initial_std": -1.0}}, "'network.initial_std' must be above 0"),
+        ({"ppo": {"gamma": 1.5}}, "'ppo.gamma' must be 0 to 1, not 1.5"),
+        ({"ppo": {"learning_rate": float("nan")}}, "'ppo.learning_rate' must be above 0"),
+        ({"foothold": {"stride": 0}}, "'foothold.stride' must be at least 1, not 0"),
+        ({"scan": {"x": [0.0, 1.0, 0]}}, "'scan.x' must be from, to, samples"),
+        ({"run": {"seed": 2**32}}, "'run.seed' must be 0 to 4294967295"),
+    ],
+)
+def test_what_cannot_run_is_refused_before_anything_is_compiled(changes, says):
+    with pytest.raises(ConfigError, match=says):
+        limits.check(config.override(Config(), changes))
+
+
+def test_a_blind_policy_takes_any_image():
+    blind = {"network": {"variant": "blind"}, "camera": {"shape": [58, 87]}}
+    limits.check(config.override(Config(), blind))
+
+
 def test_the_horizon_is_half_a_second_and_a_control_step_20_ms():
     assert Config().physics.control_period == pytest.approx(0.020)  # Sec. II-D: 50 Hz
     assert Config().run.num_envs == 4096 and Config().run.iterations == 20_000  # Sec. II-D
