@@ -488,10 +488,10 @@ def test_a_robot_alone_is_the_same_as_in_a_batch_bit_for_bit(physics, x2):
     flat = terrain.from_heights(jnp.zeros((1, 1)), CELL)
     planes = jax.jit(jax.vmap(lambda b: p.planes(flat, b)))(body)
     target = jnp.tile(x2.rest_pose, (ROBOTS, 1))
-    inputs = (*body, target, *planes, dynamics)
-    batch = jax.vmap(p.engine.substep)(*inputs)
+    inputs = SubstepInput(*body, target, *planes, dynamics)
+    batch = jax.vmap(p.engine.substep)(inputs)
     for i in (0, 7, 199):
-        alone = p.engine.substep(SubstepInput(*jax.tree.map(lambda x, i=i: x[i], inputs)))
+        alone = p.engine.substep(jax.tree.map(lambda x, i=i: x[i], inputs))
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_array_equal(a, b[i]), tuple(alone), tuple(batch)
         )
@@ -524,7 +524,7 @@ def test_a_state_that_is_not_finite_comes_back_as_nan_and_harms_no_other(physics
     rest = jax.tree.map(
         lambda x: jnp.stack([x] * count), (jnp.asarray(x2.rest_pose), p.nominal_dynamics())
     )
-    once = lambda body: jax.vmap(p.engine.substep)(*body, rest[0], *planes, rest[1])
+    once = lambda body: jax.vmap(p.engine.substep)(SubstepInput(*body, rest[0], *planes, rest[1]))
     sound = once(body_of(qpos))
     for part, where in (("qpos", 9), ("qvel", 3), ("warmstart", 0)):
         body = body_of(qpos)
