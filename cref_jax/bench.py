@@ -59,7 +59,7 @@ class Options(cli.DebugOption):
     """also write the figures to this JSON file"""
 
 
-class Row(NamedTuple):
+class StageTime(NamedTuple):
     """One measured stage."""
 
     stage: str
@@ -83,7 +83,7 @@ def main() -> None:
             options.out.write_text(json.dumps(record, indent=2) + "\n")
 
 
-def measure_stages(options: Options, rates: Rates) -> list[Row]:
+def measure_stages(options: Options, rates: Rates) -> list[StageTime]:
     """Measure every stage for each number of robots, and the whole iteration."""
     rows, console = [], Console()
     for count in options.num_envs:
@@ -103,14 +103,14 @@ def measure_stages(options: Options, rates: Rates) -> list[Row]:
     return rows
 
 
-def _measure_learners(options: Options) -> list[Row]:
+def _measure_learners(options: Options) -> list[StageTime]:
     """Measure an iteration of our PPO and of brax's, blind on flat ground."""
     c = _build_preset("flat", {"network": {"variant": "blind"}})
     seconds = c.run.num_envs / brax_peer.measure_samples_per_second(c)
-    return [_time_iteration(options, BLIND, c), Row(BRAX, c.run.num_envs, seconds, 0.0)]
+    return [_time_iteration(options, BLIND, c), StageTime(BRAX, c.run.num_envs, seconds, 0.0)]
 
 
-def _measure_stages(options: Options, rates: Rates, count: int) -> list[Row]:
+def _measure_stages(options: Options, rates: Rates, count: int) -> list[StageTime]:
     """Measure the stages with `count` robots."""
     world, state = _init_run(_stage_config(options, count), resolve_engine("auto"))
     measure = functools.partial(_time_stage, options, rates, count)
@@ -127,7 +127,7 @@ def _measure_stages(options: Options, rates: Rates, count: int) -> list[Row]:
 
 def _measure_engine(
     options: Options, rates: Rates, engine: EngineName, world: World, robots: rollout.Robots
-) -> list[Row]:
+) -> list[StageTime]:
     """Measure a control step with this engine and, for mujoco, that of MuJoCo's own batch."""
     count = len(robots.begins)
     measure = functools.partial(_time_stage, options, rates, count)
@@ -140,7 +140,7 @@ def _measure_engine(
     substep = warp_raycast.time_raw_substep(
         world.physics, robots.env.body, threads, stages.STEPS * substeps, options.repeats
     )
-    raw = Row("physics, MuJoCo's own batch", count, substep * substeps, 0.0)
+    raw = StageTime("physics, MuJoCo's own batch", count, substep * substeps, 0.0)
     return [whole, ours._replace(share=raw.seconds / ours.seconds), raw]
 
 
@@ -175,7 +175,9 @@ def compare_depth(options: Options) -> list[warp_raycast.Speed]:
         return warp_raycast.compare_renderers(lane.tile(0, 0), c.camera, lane.is_profile[0])
 
 
-def show(options: Options, rates: Rates, rows: list[Row], speeds: list[warp_raycast.Speed]) -> None:
+def show(
+    options: Options, rates: Rates, rows: list[StageTime], speeds: list[warp_raycast.Speed]
+) -> None:
     """Print the tables and the ratios."""
     table = Table(title=f"{options.terrain}, {_machine_name()}")
     columns = (
@@ -208,7 +210,7 @@ def show(options: Options, rates: Rates, rows: list[Row], speeds: list[warp_rayc
     console.print(table)
 
 
-def ratios(rows: list[Row]) -> dict[str, float]:
+def ratios(rows: list[StageTime]) -> dict[str, float]:
     """Compute the ratios between measured stages, for the largest number of robots."""
     seconds = {row.stage: row.seconds / row.robots for row in rows}
     steps = {e: seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx")}
@@ -226,7 +228,7 @@ def ratios(rows: list[Row]) -> dict[str, float]:
 
 
 def as_json(
-    options: Options, rates: Rates, rows: list[Row], speeds: list[warp_raycast.Speed]
+    options: Options, rates: Rates, rows: list[StageTime], speeds: list[warp_raycast.Speed]
 ) -> dict[str, Any]:
     """Build the JSON record of all figures and of the machine."""
     return {
@@ -252,7 +254,7 @@ def _time_stage(
     make: Callable[..., Any],
     world: World,
     state: rollout.Robots | iteration.RunState,
-) -> Row:
+) -> StageTime:
     """Compile a stage and measure its best time per control step.
 
     Each device runs it with its own robots, as in training.
@@ -269,10 +271,10 @@ def _time_stage(
     compile_seconds = time.perf_counter() - started_at
     run = lambda: jax.block_until_ready(program(world, state))
     seconds = warp_raycast.shortest_time(run, options.repeats)
-    return Row(stage, count, seconds / stages.STEPS, compile_seconds, least / seconds)
+    return StageTime(stage, count, seconds / stages.STEPS, compile_seconds, least / seconds)
 
 
-def _time_iteration(options: Options, stage: str, c: Config) -> Row:
+def _time_iteration(options: Options, stage: str, c: Config) -> StageTime:
     """Measure a whole iteration of `make train` with these settings, per control step."""
     mesh = devices.choose_mesh(c)
     world, state = _init_run(c, resolve_engine("auto"))
@@ -286,7 +288,9 @@ def _time_iteration(options: Options, stage: str, c: Config) -> Row:
         return jax.block_until_ready(log)
 
     seconds = warp_raycast.shortest_time(step, options.repeats)
-    return Row(stage, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compile_seconds)
+    return StageTime(
+        stage, c.run.num_envs, seconds / (c.ppo.horizon * c.run.chunk), compile_seconds
+    )
 
 
 if __name__ == "__main__":

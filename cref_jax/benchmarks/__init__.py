@@ -1,1 +1,1 @@
-"""Speed and memory, compared with peers and hardware bounds."""
+"""Speed and memory, measured against peers and bounds."""

@@ -30,7 +30,7 @@ WALKS = 5.0  # s of walking before that command; assumed
 DRIFT = 0.05  # m that a standing robot may move; assumed
 
 
-class Trace(NamedTuple):
+class CommandTrace(NamedTuple):
     """Motion of E robots over T control steps."""
 
     position: Float[Array | np.ndarray, "T E 2"]  # m, world
@@ -51,15 +51,15 @@ def run_commands(
     world, number = _flat_world(c, physics), np.arange(len(commands))
     robots = trials.start_robots(world, seed, number, 0 * number, 0 * number)
     trace = _record_trace(world, train, robots, jnp.asarray(commands), jnp.asarray(stop), steps)
-    trace = Trace(*map(np.asarray, trace))
+    trace = CommandTrace(*map(np.asarray, trace))
     period = c.physics.control_period
-    of = lambda k: Trace(*(x[:, k * count : (k + 1) * count] for x in trace))
+    of = lambda k: CommandTrace(*(x[:, k * count : (k + 1) * count] for x in trace))
     rows = [summarize_command(of(k), command, period) for k, command in enumerate(GRID)]
     return {"commands": rows, "stop": summarize_stop(of(len(GRID)), period)}
 
 
 def summarize_command(
-    trace: Trace, command: tuple[float, float, float], period: float
+    trace: CommandTrace, command: tuple[float, float, float], period: float
 ) -> dict[str, Any]:
     """Compute how well one command was tracked after `SETTLING` s, by the robots still upright."""
     first, upright = round(SETTLING / period), ~trace.fallen[-1]
@@ -85,7 +85,7 @@ def summarize_command(
     return result
 
 
-def summarize_stop(trace: Trace, period: float) -> dict[str, Any]:
+def summarize_stop(trace: CommandTrace, period: float) -> dict[str, Any]:
     """Compute the distance from the command to stop until the end of the trial, m."""
     first, upright = round(WALKS / period), ~trace.fallen[-1]
     distance = np.linalg.norm(trace.position[-1] - trace.position[first], axis=-1)[upright]
@@ -137,7 +137,7 @@ def _record_trace(
     commands: Float[Array, "E 3"],
     stop: Int[Array, " E"],
     steps: int,
-) -> Trace:
+) -> CommandTrace:
     """Walk the robots with these commands, and with the one to stand from step `stop` on."""
 
     def step(carry: tuple[rollout.Robots, Bool[Array, " E"]], k: Int[Array, ""]) -> Any:
@@ -149,7 +149,7 @@ def _record_trace(
         body = robots.env.body
         ahead = jax.vmap(geometry.rotate_inverse)(body.qpos[:, 3:7], body.qvel[:, :3])[:, :2]
         velocity = jnp.concatenate([ahead, body.qvel[:, 5:6]], axis=1)
-        trace = Trace(
+        trace = CommandTrace(
             body.qpos[:, :2],
             velocity,
             outcome.measures.touchdown,

@@ -69,7 +69,7 @@ class Trials(NamedTuple):
         return {name: int((self.ending == ENDINGS.index(name)).sum()) for name in FAILURES}
 
 
-class Trace(NamedTuple):
+class TrialTrace(NamedTuple):
     """Measures of E robots at T steps; after a robot's first end they belong to a new episode."""
 
     ending: Ending  # [T, E] each
@@ -141,7 +141,7 @@ def run(
     return Trials(*map(np.concatenate, zip(*(results[k] for k in sorted(results)), strict=True)))
 
 
-def classify(trace: Trace, speed: Float[np.ndarray, " E"], period: float) -> Trials:
+def classify(trace: TrialTrace, speed: Float[np.ndarray, " E"], period: float) -> Trials:
     """Classify each robot's outcome; `period` is the time between two steps, s.
 
     A fall is a failure wherever it happens, and so is an earlier stall; a robot still on its way
@@ -176,7 +176,7 @@ class _ActiveTrial:
 
     trial: int
     speed: Float[np.ndarray, "1"]  # m/s, commanded
-    parts: list[Trace] = dataclasses.field(default_factory=list)
+    parts: list[TrialTrace] = dataclasses.field(default_factory=list)
 
 
 class _Slots:
@@ -208,7 +208,7 @@ class _Slots:
         """Start to follow the trials in these slots."""
         self.active |= {k: _ActiveTrial(int(self.trial[k]), speed[k : k + 1]) for k in new}
 
-    def update(self, part: Trace, c: Config) -> dict[int, Trials]:
+    def update(self, part: TrialTrace, c: Config) -> dict[int, Trials]:
         """Add these `CHUNK` steps, and return the trials that ended in them."""
         period, over = c.physics.control_period, {}
         for slot, running in list(self.active.items()):
@@ -231,7 +231,7 @@ def _is_camera_in_phase(c: Config, clock: int) -> bool:
 
 
 def _first_ends(
-    trace: Trace, speed: Float[np.ndarray, " E"], period: float
+    trace: TrialTrace, speed: Float[np.ndarray, " E"], period: float
 ) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " E"]]:
     """Find the steps at which each episode ended and stalled; T for never."""
     over = np.asarray(trace.ending.terminated | trace.ending.truncated)
@@ -287,15 +287,17 @@ def _replace_robots(robots: Robots, fresh: Robots, is_new: Bool[Array, " E"], c:
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-def _run_chunk(world: World, step_fn: StepFn, robots: Robots, mesh: Mesh) -> tuple[Robots, Trace]:
+def _run_chunk(
+    world: World, step_fn: StepFn, robots: Robots, mesh: Mesh
+) -> tuple[Robots, TrialTrace]:
     """Step the robots `CHUNK` times."""
 
-    def advance(world: World, step_fn: StepFn, robots: Robots) -> tuple[Robots, Trace]:
-        def step(robots: Robots, _: None) -> tuple[Robots, Trace]:
+    def advance(world: World, step_fn: StepFn, robots: Robots) -> tuple[Robots, TrialTrace]:
+        def step(robots: Robots, _: None) -> tuple[Robots, TrialTrace]:
             y = robots.env.body.qpos[:, 1]
             robots, outcome = step_fn(world, robots)
             m = outcome.measures
-            return robots, Trace(outcome.ending, m.progress, m.forward_speed, y)
+            return robots, TrialTrace(outcome.ending, m.progress, m.forward_speed, y)
 
         return jax.lax.scan(step, robots, None, length=CHUNK)
 

@@ -41,7 +41,7 @@ class WalkResult(NamedTuple):
         )
 
 
-class _Step(NamedTuple):
+class _EpisodeStep(NamedTuple):
     """Contributions of one step to an episode's sums."""
 
     alive: Bool[Array, " E"]
@@ -67,19 +67,19 @@ def walk(
 @jax.jit(static_argnames=("episodes", "steps"))
 def _run_episodes(
     world: World, train: ppo.TrainState, key: PRNGKeyArray, episodes: int, steps: int
-) -> tuple[Ending, _Step]:
+) -> tuple[Ending, _EpisodeStep]:
     """Simulate the episodes; return each robot's first end and its steps [T, E] until then."""
     robots = rollout.start(world, key, episodes)
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
 
     def step(
         carry: tuple[rollout.Robots, Bool[Array, " E"]], _: None
-    ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _Step]]:
+    ) -> tuple[tuple[rollout.Robots, Bool[Array, " E"]], tuple[Ending, _EpisodeStep]]:
         before, alive = carry
         robots, _policy, outcome = rollout.step_policy(world, train, before)
         measures, ending = outcome.measures, outcome.ending
         counted = Ending(*(flag & alive for flag in ending))
-        record = _Step(
+        record = _EpisodeStep(
             alive=alive,
             forward_speed=measures.forward_speed,
             forward_error=measures.forward_command - measures.forward_speed,
@@ -101,7 +101,7 @@ def _count_by_cause(ending: Ending) -> dict[str, int]:
     return {name: int((first == k).sum()) for k, name in enumerate(trials.FALLS)}
 
 
-def _summarize(ending: Ending, trace: _Step, c: Config) -> WalkResult:
+def _summarize(ending: Ending, trace: _EpisodeStep, c: Config) -> WalkResult:
     alive, steps = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
     of_episode = lambda x: np.sum(x * alive, axis=0) / steps
     both = trace.alive[..., None]

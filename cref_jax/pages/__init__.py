@@ -1,1 +1,1 @@
-"""Reports as self-contained HTML pages."""
+"""Reports as single HTML pages."""

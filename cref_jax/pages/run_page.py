@@ -23,7 +23,7 @@ PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx"
 Settings = dict[str, Any]
 
 
-class Run(NamedTuple):
+class RunRecord(NamedTuple):
     """The contents of a run's folder."""
 
     folder: Path
@@ -34,7 +34,7 @@ class Run(NamedTuple):
     checkpoints: tuple[int, ...]  # iterations
 
 
-def read(folder: Path) -> Run:
+def read(folder: Path) -> RunRecord:
     """Read the settings, the starts, the log and the checkpoint numbers of a run.
 
     Raises:
@@ -55,10 +55,10 @@ def read(folder: Path) -> Run:
     except ConfigError as error:
         reason = str(error)
     steps = sorted(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdecimal())
-    return Run(folder, settings, tuple(_read_starts(folder)), log, reason, tuple(steps))
+    return RunRecord(folder, settings, tuple(_read_starts(folder)), log, reason, tuple(steps))
 
 
-def document(run: Run) -> str:
+def document(run: RunRecord) -> str:
     """Build the page of a run."""
     sections = [
         Section("Overview", _overview_list(run)),
@@ -156,7 +156,7 @@ def _read_starts(folder: Path) -> Iterator[dict[str, Any]]:
             yield start
 
 
-def _make_tiles(run: Run) -> Html:
+def _make_tiles(run: RunRecord) -> Html:
     """Build the tiles with the headline figures of a run."""
     if run.log is None:
         return Html()
@@ -170,7 +170,7 @@ def _make_tiles(run: Run) -> Html:
     return markup.tiles([*values, *learning_charts.latest_values(log)])
 
 
-def _overview_list(run: Run) -> Html:
+def _overview_list(run: RunRecord) -> Html:
     """Build the list of a run's main settings, its progress and its checkpoints."""
     of = lambda *path: _look_up(run.settings, *path)
     values = [
@@ -186,7 +186,7 @@ def _overview_list(run: Run) -> Html:
     return markup.definition_list(values)
 
 
-def _describe_progress(run: Run) -> str:
+def _describe_progress(run: RunRecord) -> str:
     """Describe the progress of the run in words."""
     total = _look_up(run.settings, "run", "iterations")
     if run.log is None or not isinstance(total, int):
@@ -200,7 +200,7 @@ def _describe_progress(run: Run) -> str:
     return f"stopped or still training: {done:,} of {total:,} iterations; {when}"
 
 
-def _learning_sections(run: Run) -> Iterator[Section]:
+def _learning_sections(run: RunRecord) -> Iterator[Section]:
     if run.log is None:
         command = _make_command("train", run.folder, "--resume")
         missing = note(f"{run.no_log}. Training writes it: ", command)
@@ -214,7 +214,7 @@ def _learning_sections(run: Run) -> Iterator[Section]:
     )
 
 
-def _evaluation_sections(run: Run) -> Iterator[Section]:
+def _evaluation_sections(run: RunRecord) -> Iterator[Section]:
     """Yield the newest evaluation of each suite."""
     shown, older = {}, []
     files = sorted(run.folder.glob("eval*.json"), key=lambda p: (-p.stat().st_mtime, p.name))

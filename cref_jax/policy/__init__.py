@@ -1,1 +1,1 @@
-"""A trained policy: its sources, its export and its import."""
+"""A trained policy: where it comes from, and how it is exported and read back."""

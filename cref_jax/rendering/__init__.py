@@ -1,1 +1,1 @@
-"""Images and videos of the robot on its terrain."""
+"""Pictures and films of the robot on its terrain."""

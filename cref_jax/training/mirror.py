@@ -24,7 +24,7 @@ ROTATION = np.array([1.0, -1.0, 1.0, -1.0], np.float32)  # signs of a quaternion
 COMMAND = np.array([1.0, -1.0, -1.0], np.float32)  # m/s ahead, m/s to the left, rad/s to the left
 
 
-class Joints(NamedTuple):
+class JointPairs(NamedTuple):
     """The mirrored partner and sign of each joint."""
 
     partner: Int[np.ndarray, " M"]
@@ -36,7 +36,7 @@ class Joints(NamedTuple):
         return values[..., self.partner[:first]] * self.sign[:first]
 
 
-def pair_joints(model: mujoco.MjModel) -> Joints:
+def pair_joints(model: mujoco.MjModel) -> JointPairs:
     """Pair each hinge with its partner by name, and derive the sign from both axes.
 
     Raises:
@@ -51,7 +51,7 @@ def pair_joints(model: mujoco.MjModel) -> Joints:
     sign = np.sum(AXIAL * axes * axes[partner], axis=1)
     if not np.allclose(np.abs(sign), 1.0, atol=1e-6):
         raise ValueError(f"{names[int(np.abs(sign).argmin())]} does not turn about a mirrored axis")
-    return Joints(partner, np.sign(sign).astype(np.float32))
+    return JointPairs(partner, np.sign(sign).astype(np.float32))
 
 
 def make_mirror(model: mujoco.MjModel, c: config.Network) -> Mirror:
@@ -66,7 +66,7 @@ def make_mirror(model: mujoco.MjModel, c: config.Network) -> Mirror:
     )
 
 
-def body(state: Body, of: Joints) -> Body:
+def body(state: Body, of: JointPairs) -> Body:
     """Mirror a state."""
     q, v, w = state.qpos, state.qvel, state.warmstart
     speeds = lambda x: jnp.concatenate([POLAR * x[:3], AXIAL * x[3:6], of.flip(x[6:])])
@@ -74,7 +74,7 @@ def body(state: Body, of: Joints) -> Body:
     return Body(place, speeds(v), speeds(w))
 
 
-def proprioception(obs: Float[Array, "*n O"], of: Joints) -> Float[Array, "*n O"]:
+def proprioception(obs: Float[Array, "*n O"], of: JointPairs) -> Float[Array, "*n O"]:
     """Compute M o^p, the mirrored proprioception."""
     where = observations.slices(observations.num_joints_of(obs.shape[-1]))
     signs = {"angular_velocity": AXIAL, "gravity": POLAR, "command": COMMAND}

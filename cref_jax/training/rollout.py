@@ -44,7 +44,7 @@ class Robots:
     feed: CameraFeed | None = None  # None for a blind policy
 
 
-class Networks(NamedTuple):
+class Modules(NamedTuple):
     """The trained modules."""
 
     actor: network.Actor
@@ -91,9 +91,9 @@ def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Rob
     )
 
 
-def networks(c: config.Network, num_actions: int) -> Networks:
+def networks(c: config.Network, num_actions: int) -> Modules:
     """Build the actor and the critic."""
-    return Networks(network.Actor(c, num_actions), network.Critic(c))
+    return Modules(network.Actor(c, num_actions), network.Critic(c))
 
 
 def initial_params(
@@ -162,7 +162,7 @@ def with_twins(robots: Robots) -> Robots:
 
 
 def policy_step(
-    nets: Networks, train: ppo.TrainState, robots: Robots
+    nets: Modules, train: ppo.TrainState, robots: Robots
 ) -> tuple[Memory, network.Output]:
     """Apply the policy; return its memory after this step and its outputs, [1, E, ...].
 
@@ -181,7 +181,7 @@ def policy_step(
 
 
 def _apply_actor(
-    nets: Networks,
+    nets: Modules,
     train: ppo.TrainState,
     begins: Bool[Array, " E"],
     proprioception: Float[Array, "E O"],
@@ -228,7 +228,7 @@ def step_policy(
 
 
 def collect(
-    world: World, nets: Networks, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
+    world: World, nets: Modules, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
 ) -> tuple[Robots, ppo.Rollout, Trace]:
     """Collect a horizon of experience, with actions sampled from the policy.
 
@@ -310,7 +310,7 @@ def _store_frame(collection: _Collection) -> _Collection:
 
 def _to_rollout(
     c: config.Config,
-    nets: Networks,
+    nets: Modules,
     train: ppo.TrainState,
     memory: Memory,
     frames: Float16[Array, "K E rows columns pixels"] | None,

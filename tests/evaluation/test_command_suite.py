@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from cref_jax.evaluation import command_suite
-from cref_jax.evaluation.command_suite import Trace
+from cref_jax.evaluation.command_suite import CommandTrace
 
 PERIOD = 0.02  # s
 STEPS = 500  # 10 s
 
 
-def trace(speed, steps=(), fell_at=None, air=(0.0, 0.0)) -> Trace:
+def trace(speed, steps=(), fell_at=None, air=(0.0, 0.0)) -> CommandTrace:
     """Return one robot that walks ahead at `speed` [T] m/s and steps at these control steps."""
     ahead = np.broadcast_to(np.asarray(speed, float), STEPS)
     position = np.stack([np.cumsum(ahead) * PERIOD, np.zeros(STEPS)], axis=-1)
@@ -22,11 +22,11 @@ def trace(speed, steps=(), fell_at=None, air=(0.0, 0.0)) -> Trace:
     if fell_at is not None:
         fallen[fell_at:] = True
     velocity = np.stack([ahead, np.zeros(STEPS), np.zeros(STEPS)], axis=-1)
-    return Trace(position[:, None], velocity[:, None], touchdown, airborne, fallen)
+    return CommandTrace(position[:, None], velocity[:, None], touchdown, airborne, fallen)
 
 
-def together(*traces) -> Trace:
-    return Trace(*(np.concatenate(parts, axis=1) for parts in zip(*traces, strict=True)))
+def together(*traces) -> CommandTrace:
+    return CommandTrace(*(np.concatenate(parts, axis=1) for parts in zip(*traces, strict=True)))
 
 
 def test_who_stands_stays_within_5_cm_and_takes_no_step_after_2_s():

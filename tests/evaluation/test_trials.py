@@ -13,7 +13,7 @@ from cref_jax import config
 from cref_jax.config import Config
 from cref_jax.env.state import Ending
 from cref_jax.evaluation import crossing, protocol, tables, trials
-from cref_jax.evaluation.trials import ENDINGS, Trace
+from cref_jax.evaluation.trials import ENDINGS, TrialTrace
 from cref_jax.physics.simulation import Physics
 from cref_jax.training import rollout
 
@@ -185,7 +185,9 @@ def trace(steps, robots=1, progress=0.01, **flags):
     )
     way = progress * np.arange(1, steps + 1)[:, None] * np.ones(robots)
     aside = 0.001 * np.arange(steps)[:, None] * np.ones(robots)
-    return Trace(ending, way.astype(np.float32), np.full((steps, robots), 0.5, np.float32), aside)
+    return TrialTrace(
+        ending, way.astype(np.float32), np.full((steps, robots), 0.5, np.float32), aside
+    )
 
 
 @pytest.mark.parametrize(

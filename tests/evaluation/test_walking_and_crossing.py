@@ -6,11 +6,11 @@ import pytest
 from cref_jax.config import Config, override
 from cref_jax.env.state import Ending
 from cref_jax.evaluation import crossing, protocol, walking
-from cref_jax.evaluation.walking import _Step, _summarize
+from cref_jax.evaluation.walking import _EpisodeStep, _summarize
 
 
-def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _Step:
-    return _Step(
+def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _EpisodeStep:
+    return _EpisodeStep(
         alive=alive,
         forward_speed=np.full(alive.shape, 0.5, np.float32),
         forward_error=np.full(alive.shape, error, np.float32),
