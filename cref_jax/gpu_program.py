@@ -49,7 +49,7 @@ STAGES = (  # stage, file and, unless empty, function in the stack; the first ma
     ("physics: tangent planes", "cref_jax/physics/simulation.py", "planes"),
     ("physics: rest", "cref_jax/physics/simulation.py", "step"),
     ("update", "cref_jax/ppo/learner.py", "update"),
-    ("policy", "cref_jax/training/rollout.py", "policy_step"),
+    ("policy", "cref_jax/training/rollout.py", "apply_policy"),
     ("depth", "cref_jax/training/camera_feed.py", "render_frames"),
     ("environment: rest", "cref_jax/env/", ""),
     ("rollout: rest", "cref_jax/training/rollout.py", ""),

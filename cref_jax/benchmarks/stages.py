@@ -101,7 +101,7 @@ def run_policy(world: World, state: iteration.RunState) -> Any:
     def step(robots: rollout.Robots, clock: Any) -> tuple[rollout.Robots, Any]:
         due = depth.is_due(clock, c.camera, c.physics.control_period)
         feed = robots.feed and robots.feed.replace(fresh=due)
-        memory, policy = rollout.policy_step(nets, state.train, robots.replace(feed=feed))
+        memory, policy = rollout.apply_policy(nets, state.train, robots.replace(feed=feed))
         return robots.replace(memory=memory), policy.mean.sum()
 
     return jax.lax.scan(step, state.robots, jnp.arange(STEPS))

@@ -137,7 +137,8 @@ def to_table(rows: Sequence[dict[str, Any]], whole: dict[str, Any]) -> Table:
     for row in rows:
         both_ways = row["up_failures"], row["down_failures"]
         table.add_row(
-            f"{row['kind']} {100 * row['size_m']:.0f} cm" + " (OOD)" * (row["level"] == "ood"),
+            f"{row['kind']} {100 * row['size_m']:.0f} cm"
+            + (" (OOD)" if row["level"] == "ood" else ""),
             str(row["trials"]),
             *_comparison_columns(
                 row["rate"], row["paper"]["rate"], _rate(row), row["paper"]["significant"]

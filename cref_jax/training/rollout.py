@@ -161,7 +161,7 @@ def with_twins(robots: Robots) -> Robots:
     return robots.replace(memory=robots.memory._replace(twin=blank))
 
 
-def policy_step(
+def apply_policy(
     nets: Modules, train: ppo.TrainState, robots: Robots
 ) -> tuple[Memory, network.Output]:
     """Apply the policy; return its memory after this step and its outputs, [1, E, ...].
@@ -222,7 +222,7 @@ def step_policy(
     The output, [1, E, ...], belongs to the observation before the step.
     """
     nets = networks(world.config.network, world.physics.robot.num_joints)
-    memory, output = policy_step(nets, train, robots)
+    memory, output = apply_policy(nets, train, robots)
     after, outcome = env_step(world, robots, memory, output.mean[0])
     return after, output, outcome
 
@@ -242,7 +242,7 @@ def collect(
 
     def step(collection: _Collection, noise: Float[Array, "E J"]) -> tuple[_Collection, _Step]:
         robots = collection.robots
-        memory, policy = policy_step(nets, train, robots)
+        memory, policy = apply_policy(nets, train, robots)
         mean = policy.mean[0]
         action = mean + jnp.exp(policy.log_std) * noise
         after, outcome = env_step(world, robots, memory, action)

@@ -121,7 +121,7 @@ def test_the_twin_lives_what_a_mirrored_robot_would(symmetric):
     world, state = symmetric
     of = mirror.make_mirror(world.physics.model, world.config.network)
     nets = rollout.networks(world.config.network, world.physics.robot.num_joints)
-    act = jax.jit(lambda nets, r: rollout.policy_step(nets, state.train, r), static_argnums=0)
+    act = jax.jit(lambda nets, r: rollout.apply_policy(nets, state.train, r), static_argnums=0)
     keys = iter(jax.random.split(jax.random.key(5), 9))
     noise = lambda x: jax.random.uniform(next(keys), x.shape, x.dtype)
     robots = state.robots

@@ -132,7 +132,7 @@ def test_sixteen_bits_are_enough_for_a_frame():
 
 def test_changing_one_robot_changes_no_other(seeing):
     _, nets, train, (before, _, _), _ = seeing
-    act = jax.jit(lambda r: rollout.policy_step(nets, train, r)[1].mean)
+    act = jax.jit(lambda r: rollout.apply_policy(nets, train, r)[1].mean)
     moved = before.replace(
         observation=jax.tree.map(lambda x: x.at[0].add(1.0), before.observation),
         feed=dataclasses.replace(
