@@ -21,9 +21,14 @@ class Count:
     lo: UInt32[Array, ""]
 
     def __add__(self, more: Int[Array, ""] | int) -> "Count":
-        """Add a number of samples that fits in 32 bits."""
-        lo = self.lo + jnp.uint32(more)
-        return Count(self.hi + (lo < self.lo).astype(jnp.uint32), lo)
+        """Add samples: a number of a program fits 32 bits, one of Python has any size."""
+        high, low = divmod(more, 2**32) if isinstance(more, int) else (0, more)
+        lo = self.lo + jnp.uint32(low)
+        return Count(self.hi + jnp.uint32(high) + (lo < self.lo).astype(jnp.uint32), lo)
+
+    def __int__(self) -> int:
+        """Convert to a Python number."""
+        return (int(self.hi) << 32) + int(self.lo)
 
     def as_float(self) -> Float[Array, ""]:
         """Return the nearest float32."""
