@@ -29,10 +29,11 @@ class PolicyOptions(DebugOption):
 
 
 @contextlib.contextmanager
-def one_line_errors(debug: bool = False) -> Iterator[None]:
+def one_line_errors(debug: bool = False, is_program: bool = True) -> Iterator[None]:
     """Print errors a user can fix as one line on stderr and exit with 2; `debug` re-raises them.
 
-    Failed training exits with 1, Ctrl-C with 130.
+    Failed training exits with 1, Ctrl-C with 130, unless a notebook or a script has called the
+    command, which goes on.
     """
     try:
         yield
@@ -42,9 +43,8 @@ def one_line_errors(debug: bool = False) -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1 if isinstance(error, TrainingError) else 2)
     except KeyboardInterrupt:
-        program = getattr(sys.modules["__main__"], "__spec__", None)
-        if program is None or not program.name.startswith("cref_jax."):
-            raise  # called by a notebook or a script, which goes on
+        if not is_program:
+            raise
         print("interrupted", file=sys.stderr)
         sys.stdout.flush()
         os._exit(130)  # at once: a running XLA program may still call into this interpreter

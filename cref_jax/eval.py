@@ -83,7 +83,7 @@ class Subject(NamedTuple):
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(options.debug, arguments is None):
         jax_setup.prepare([options.engine])
         subjects = [_subject(path, options) for path in _resolve_sources(options)]
         source = subjects[0].source

@@ -24,7 +24,7 @@ class Options(cli.DebugOption):
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.params")
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(options.debug, arguments is None):
         Console().print(
             build_table({name: count_parameters(name) for name in typing.get_args(config.Variant)})
         )

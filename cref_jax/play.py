@@ -118,7 +118,7 @@ class Step(NamedTuple):
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.play")
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(options.debug, arguments is None):
         jax_setup.prepare()
         play(options)
 

@@ -26,7 +26,7 @@ class Options(cli.PolicyOptions):
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.report")
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(options.debug, arguments is None):
         if options.out:
             markup.check_name(options.out)
         source = sources.resolve_policy(options.run, options.policy)

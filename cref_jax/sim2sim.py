@@ -64,7 +64,7 @@ class Options(cli.DebugOption):
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.sim2sim")
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(options.debug, arguments is None):
         jax_setup.prepare()
         if options.trials < 1:
             raise ConfigError(f"--trials must be at least 1, not {options.trials}")

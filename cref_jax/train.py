@@ -83,8 +83,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    with cli.one_line_errors(debug="--debug" in arguments):
+    is_program, arguments = arguments is None, sys.argv[1:] if arguments is None else arguments
+    with cli.one_line_errors("--debug" in arguments, is_program):
         jax_setup.prepare([_options(arguments).engine])
         options, c = parse(arguments)
         if options.print_config:

@@ -16,7 +16,7 @@ def test_what_a_user_can_mend_is_one_line(capsys, error, code):
 
 
 def test_ctrl_c_leaves_a_program_that_calls_a_command_alive():
-    with pytest.raises(KeyboardInterrupt), cli.one_line_errors():
+    with pytest.raises(KeyboardInterrupt), cli.one_line_errors(is_program=False):
         raise KeyboardInterrupt
 
 

@@ -49,7 +49,8 @@ def dotted(path: Path) -> str:
 MODULES = {dotted(path): path for path in FILES}
 
 
-COMMANDS = {name for name, path in MODULES.items() if "__main__" in path.read_text()} - {"deploy"}
+MAIN = 'if __name__ == "__main__":'
+COMMANDS = {name for name, path in MODULES.items() if MAIN in path.read_text()} - {"deploy"}
 FLOOR = {name: number for number, floor in enumerate([*FLOORS, COMMANDS]) for name in floor}
 
 
