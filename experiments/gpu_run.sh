@@ -11,7 +11,7 @@
 set -euo pipefail
 
 here=$(cd "$(dirname "$0")" && pwd)
-PACKAGES="brax docstring_parser flax glfw imageio-ffmpeg jaxopt jaxtyping ml_collections mujoco
+PACKAGES="brax cloudpickle docstring_parser flax glfw imageio-ffmpeg jaxopt jaxtyping loky ml_collections mujoco
   mujoco-core mujoco-mjx optax orbax-checkpoint tensorboardX trimesh typeguard tyro warp-lang"
 
 fail() { echo "error: $*" >&2; exit 2; }
