@@ -80,7 +80,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
         (["--iterations", "-3"], "'run.iterations' must be at least 1"),
         (["--physics.timestep", "1.0"], "'physics.timestep' must be"),
         (["--resume", "--run-dir", "nowhere"], "nowhere is not a run"),
-        (["--init", "nowhere"], "nowhere is not a run"),
+        (["--init", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
         (
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],
             "has another network: ",

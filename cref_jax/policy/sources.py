@@ -48,6 +48,9 @@ def read_config(path: Path) -> Config:
     Raises:
         ConfigError: it is none of these.
     """
+    if not path.exists():
+        bundled = sorted(folder.name for folder in folders.data_folder("policies").iterdir())
+        raise ConfigError(f"there is no run or policy {path}; bundled are {', '.join(bundled)}")
     if learner_file.is_learner(path):
         return learner_file.read_config(path)
     return (
