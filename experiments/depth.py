@@ -18,6 +18,7 @@ import tyro
 from cref_jax import config, depth, robot, terrain
 from cref_jax.robot import kinematics
 from cref_jax.terrain import lanes
+from cref_jax.terrain.generators import format_size
 
 BEFORE = 0.6  # m, from the pelvis to the first column not at z = 0
 LEVEL = 5  # of 0 to 9
@@ -38,7 +39,7 @@ def main() -> None:
     atlas = lanes.build(config.Terrain(name="mixed"))
     figure, axes = plt.subplots(2, 4, figsize=(11, 4.6), constrained_layout=True)
     views = {
-        f"{name}, {atlas.sizes[LEVEL, kind]:.2f}" + " m" * (name != "slope"): render_view(
+        f"{name}, {format_size(name, atlas.sizes[LEVEL, kind])}": render_view(
             c, atlas.tile(LEVEL, kind), lift=0.0
         )
         for kind, name in enumerate(atlas.kinds)

@@ -14,7 +14,7 @@ import pytest
 
 from cref_jax import config, export, train
 from cref_jax.env.world import build_world
-from cref_jax.errors import ConfigError
+from cref_jax.errors import CheckpointError, ConfigError
 from cref_jax.policy import reader, sources, trained, writer
 from cref_jax.training import devices, iteration, run_dir
 from cref_jax.training.checkpoint import Checkpoints
@@ -56,6 +56,25 @@ def test_a_resumed_run_keeps_its_terrain_and_its_experiment(first, tmp_path):
     train.parse([*resume, "--experiment", "smoke"])
     with pytest.raises(ConfigError, match="experiment 'smoke', not 'full'"):
         train.parse([*resume, "--experiment=full"])
+
+
+def test_robots_of_another_version_begin_anew_and_what_was_learned_stays(
+    first, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(first, tmp_path / "run")
+    whole = Checkpoints.restore
+
+    def restore(steps, like, parts=None, **more):
+        if parts is None:
+            raise CheckpointError("run/2: robots/env/new: absent on disk, float32[8] here")
+        return whole(steps, like, parts=parts, **more)
+
+    monkeypatch.setattr(Checkpoints, "restore", restore)
+    run(tmp_path / "run", "--resume", "--iterations", "3")
+    said = capsys.readouterr().out
+    assert "of another version: run/2: robots/env/new" in said and "the robots start anew" in said
+    monkeypatch.setattr(Checkpoints, "restore", whole)
+    assert Checkpoints(tmp_path / "run" / "checkpoints").latest() == 3
 
 
 def state_of(folder: Path) -> list[np.ndarray]:

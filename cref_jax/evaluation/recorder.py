@@ -32,6 +32,7 @@ from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene
 from cref_jax.terrain import Terrain, cross_section, lanes
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.terrain.generators import size_unit
 from cref_jax.training import rollout
 
 CHUNK = 50  # steps per call of the compiled program: 1 s; does not affect results
@@ -141,7 +142,7 @@ def start_robots(world: World, seed: int, count: int) -> rollout.Robots:
 def lane_name(world: World, kind: str) -> str:
     """Format a lane's kind and the size of its obstacles."""
     size = 100 * float(world.lanes.sizes[0, world.lanes.kinds.index(kind)])
-    return f"{kind}, {size:.0f} {'%' if kind == 'slope' else 'cm'}" if size else kind
+    return f"{kind}, {size:.0f} {size_unit(kind)}" if size else kind
 
 
 def default_num_envs(requested: int | None, on_accelerator: int) -> int:

@@ -189,12 +189,13 @@ class Kind(NamedTuple):
 
     heights: Callable[..., Heights]
     shape: type
+    is_gradient: bool = False  # its size is m/m and not m
 
 
 KINDS: dict[str, Kind] = {
     "flat": Kind(flat, Flat),
     "rough": Kind(rough, Rough),
-    "slope": Kind(slope, Slope),
+    "slope": Kind(slope, Slope, is_gradient=True),
     "stairs_up": Kind(stairs_up, Stairs),
     "stairs_down": Kind(stairs_down, Stairs),
     "ascent": Kind(ascent, Flight),
@@ -204,9 +205,14 @@ KINDS: dict[str, Kind] = {
 }
 
 
+def size_unit(kind: str) -> str:
+    """Return the unit in which a size is shown, hundredths of that in which it is given."""
+    return "%" if kind in KINDS and KINDS[kind].is_gradient else "cm"
+
+
 def format_size(kind: str, size: float) -> str:
-    """Format a size: the gradient of a slope in %, any other size in cm."""
-    return f"{100.0 * size:.3g} {'%' if kind == 'slope' else 'cm'}"
+    """Format a size: a gradient in %, any other size in cm."""
+    return f"{100.0 * size:.3g} {size_unit(kind)}"
 
 
 def columns(metres: float, c: config.Terrain) -> int:

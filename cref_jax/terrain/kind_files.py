@@ -108,11 +108,11 @@ def read_kind(c: config.Terrain, kind: str) -> KindNumbers:
     """Read the parameters of one kind, from the terrain's own file or a default that defines it."""
     if kind not in KINDS:
         raise ConfigError(config.describe_unknown("kind", kind, list(KINDS)))
-    for name in [c.name, "mixed", "flight"]:
+    for name in [c.name, "mixed", *terrain_names()]:
         numbers = {} if Path(name).suffix in (".npy", ".png") else read_kinds(name)
         if kind in numbers:
             return numbers[kind]
-    raise ConfigError(f"neither '{c.name}' nor 'mixed' nor 'flight' has the kind '{kind}'")
+    raise ConfigError(f"neither '{c.name}' nor any file in terrains/ has the kind '{kind}'")
 
 
 def _parse_kinds(table: dict[str, Any], where: str) -> dict[str, KindNumbers]:
