@@ -2,6 +2,7 @@
 
 import ast
 import itertools
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -142,6 +143,15 @@ def test_only_startup_changes_the_environment_when_it_is_imported():
         if "os.environ.setdefault" in text or "os.environ[" in text:
             changes.append(name)
     assert changes == ["deploy", "system.startup"]  # deploy stands alone on the robot
+
+
+def test_importing_the_package_leaves_jax_unused():
+    """Or devices could not be chosen any more: training would have one core of all."""
+    every = "; ".join(f"import cref_jax.{name}" for name in MODULES if name)
+    unused = "import jax; jax.config.update('jax_num_cpu_devices', 3)"
+    code = f"{every}; {unused}; assert jax.device_count() == 3"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
 
 
 def test_the_package_itself_is_only_a_docstring():

@@ -6,6 +6,7 @@ where the episode began, so that the state holds nothing of them, and follow the
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cref_jax import terrain
@@ -14,7 +15,7 @@ from cref_jax.env.world import World
 
 PRESENT = 0.5  # chance of each to be there; assumed
 FREE = 0.45  # m from the lane's middle to the nearest surface beside it; assumed: arms pass
-ABSENT = jnp.array([0.0, 0.0, -100.0, 0.0, 0.0, -100.0, 0.0])  # far below everything
+ABSENT = np.array([0.0, 0.0, -100.0, 0.0, 0.0, -100.0, 0.0], np.float32)  # far below everything
 
 
 def sample_structures(world: World, state: EnvState) -> Float[Array, "S 7"]:
