@@ -94,7 +94,9 @@ def _run_kind(
     print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
     said = Counter(flag.name for trial in trials for flag in deploy.Status if flag & trial.status)
     if said:
-        print("the policy said: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
+        print("status of the policy: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
+        if deploy.Status.NO_DEPTH.name in said:
+            print("NO_DEPTH: before the first frame, as at every start, or because none came")
     record = {"stand_in": result._asdict(), "status": said}
     if options.compare:
         theirs = run_in_training(policy, physics, options)

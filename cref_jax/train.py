@@ -246,7 +246,8 @@ def _headline(run: Path, c: Config, options: Options, first: int) -> str:
 
 def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:
     """Print the evaluation and the next command."""
-    if options.evaluate:
+    if options.evaluate and int(state.train.iteration) >= c.run.iterations:
+        print("evaluating 100 episodes on flat ground ...", flush=True)
         physics = build_physics(c, options.engine)
         one = jax.device_put(trained.with_averaged_actor(state.train), jax.devices()[0])
         result = walking.walk(c, physics, one)

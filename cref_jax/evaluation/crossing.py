@@ -34,7 +34,9 @@ class LaneResult(NamedTuple):
         causes = ", ".join(f"{n} {cause}" for cause, n in self.by_cause.items() if n)
         return (
             f"{self.kind} {generators.format_size(self.kind, self.size_m)}: {self.successes} of "
-            f"{self.trials} trials crossed, {self.seconds:.1f} s each, {self.speed:.2f} m/s"
+            f"{self.trials} trials crossed, "
+            + (f"{self.seconds:.1f} s each, " if self.successes else "")
+            + f"{self.speed:.2f} m/s"
             + (f"; failures: {causes}" if causes else "")
         )
 

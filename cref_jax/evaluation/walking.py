@@ -37,7 +37,7 @@ class WalkResult(NamedTuple):
             f"{self.episodes - self.fell} of {self.episodes} episodes without a fall, "
             f"speed error {self.speed_error:.3f} m/s, "
             f"feet off the ground {left:.0%} and {right:.0%} of the time, "
-            f"{self.step_seconds:.2f} s per stride"
+            + (f"{self.step_seconds:.2f} s per stride" if self.step_seconds < 5.0 else "no steps")
         )
 
 
