@@ -91,7 +91,7 @@ def _run_kind(
     world = crossing.crossing_world(policy.config, physics, options.kind, options.size)
     trials = run_trials(world, path, options)
     result = summarize(trials, options)
-    print(f"MuJoCo C, 31 joints, numpy: {result.line()}")
+    print(f"whole robot, MuJoCo C, numpy: {result.line()}")
     said = Counter(flag.name for trial in trials for flag in deploy.Status if flag & trial.status)
     if said:
         print("status of the policy: " + ", ".join(f"{k} in {n} trials" for k, n in said.items()))
