@@ -1,4 +1,4 @@
-"""The whole robot: all 31 joints in MuJoCo C on solid boxes, driven by an exported policy.
+"""The whole robot: all joints in MuJoCo C on solid boxes, driven by an exported policy.
 
 It shares nothing with the training simulation: the ground is solids, not tangent planes; depth
 comes from MuJoCo's own ray-cast; the upper body is held by its motors; and deploy.py runs the
