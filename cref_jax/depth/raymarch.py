@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cref_jax import config
 from cref_jax.terrain import BLOCKS, Terrain, block_bottom, block_top
 
-_ALONG = 1e-6  # columns/m, minimum slope of a ray against the borders of columns
+ALONG = 1e-6  # columns/m, minimum slope of a ray against the borders of columns
 _LOW = 8.0  # columns of height; lower relief is walked, 8 to 20 borders at 40 to 20 degrees
 # a float plus this is whole, and its lowest bits are the integer
 _ROUNDER = np.float32(1.5 * 2**23)
@@ -130,7 +130,7 @@ def _find_relief(
 
 
 def _avoid_zero(slope: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    return jnp.where(jnp.abs(slope) < _ALONG, _ALONG, slope)
+    return jnp.where(jnp.abs(slope) < ALONG, ALONG, slope)
 
 
 def _inverse_if_down(to_z: Float[Array, "*n"]) -> Float[Array, "*n"]:

@@ -9,8 +9,6 @@ from cref_jax import config, terrain
 from cref_jax.depth import raymarch
 from cref_jax.terrain import Terrain
 
-ALONG = 1e-6  # columns/m, minimum slope of a ray against the borders of columns
-
 
 def profile_depth(
     ground: Terrain,
@@ -28,7 +26,7 @@ def profile_depth(
     running maximum of m is below s. The columns run forward and backward from the camera's own.
     """
     to_x, to_z = (row[0] * x + row[1] * y + row[2] for row in (rotation[0], rotation[2]))
-    per_x = 1.0 / jnp.maximum(jnp.abs(to_x), ALONG * ground.cell)
+    per_x = 1.0 / jnp.maximum(jnp.abs(to_x), raymarch.ALONG * ground.cell)
     slope, forward = to_z * per_x, to_x > 0.0
 
     place = (position[0] - ground.origin[0]) * (1.0 / ground.cell)
