@@ -63,7 +63,7 @@ def test_a_mistake_is_one_line(capsys, monkeypatch, tmp_path, arguments, said):
 def test_what_is_no_policy_is_refused(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert "not both" in refused(capsys, "--run", "one", "--policy", "another")
-    assert "nowhere is not a run" in refused(capsys, "--run", "nowhere")
+    assert "there is no run or policy nowhere" in refused(capsys, "--run", "nowhere")
     assert list(tmp_path.iterdir()) == []
 
 
