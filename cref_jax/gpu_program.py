@@ -27,7 +27,7 @@ from jaxtyping import PyTree
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, depth
+from cref_jax import cli, depth, robot
 from cref_jax.benchmarks import hlo
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World
@@ -196,7 +196,7 @@ def abstract_world(c: Config, engine: Backend, place: NamedSharding) -> World:
     physics, count = Physics(c.robot, c.physics, engine), c.episode.bank_size
     positions, velocities = physics.model.nq, physics.model.nv
     bank = Body(shape(count, positions), shape(count, velocities), shape(count, velocities))
-    return World(c, physics, _abstract_arrays(lanes.build(c.terrain), place), bank)
+    return World(robot.fill_in(c), physics, _abstract_arrays(lanes.build(c.terrain), place), bank)
 
 
 def _abstract_arrays(arrays: PyTree, place: NamedSharding) -> PyTree:

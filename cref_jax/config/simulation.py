@@ -55,7 +55,7 @@ class Scan:
     ahead: tuple[float, float, int] = (-0.2, 1.0, 25)
     """m from, m to, samples of a finer row along x in the middle. assumed: 10 cm cannot tell where
     an edge is"""
-    base_height: float = 0.62  # m, nominal, taken off; the base above the soles at q_0
+    base_height: float | None = None  # m, taken off: nominal, above the soles; None: the robot's
     clip: float = 1.0  # m; assumed
 
 

@@ -56,9 +56,9 @@ class Reward:
     low_speed: float = 0.2  # m/s, v_s; assumed: between 0.1 and 0.2 in published code
     standing: float = 0.1  # u_s; assumed: between 0.05 and 0.1 in published code
     single_contact_window: float = 0.2  # s, Table I
-    feet_y_target: float = 0.27  # m, Table I
+    feet_y_target: float | None = None  # m, Table I; None: the robot's
     foothold_tolerance: float = 0.08  # m, s_xz; assumed: the one published reimplementation
-    base_height_target: float = 0.55  # m above the ankle-roll frames, Table I
+    base_height_target: float | None = None  # m above the ankles, Table I; None: the robot's
     support_force: float = 1.0  # N, Eq. 5
     contact_force: float = 5.0  # N, Table I (foot slip)
     air_time_target: float = 0.5  # s, Table I
@@ -120,9 +120,7 @@ class Episode:
 
     length: float = 20.0  # s; assumed: 20 s in training, 40 s in evaluation
     max_tilt: float = 1.0  # rad; assumed
-    min_height: float = 0.15
-    """m, pelvis above the supporting ankles, 0.22 above the sole. assumed: a foot comes down on a
-    box of 40 cm when the pelvis is still 0.3 m above the box"""
+    min_height: float | None = None  # m, base above the supporting ankles; None: the robot's
     below_edge: float = 0.5
     """m, a foot below the last support: it is in a gap. assumed: two 23 cm treads at once are still
     a step, and gap floors lie 1 m down"""

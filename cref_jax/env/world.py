@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
+from cref_jax import robot as robots
 from cref_jax import terrain
 from cref_jax.config import Config
 from cref_jax.physics.records import Body, EngineName
@@ -32,6 +33,7 @@ def make_world(c: Config, physics: Physics) -> World:
     Raises:
         ConfigError: the terrain is unknown or its numbers cannot be used.
     """
+    c = robots.fill_in(c)
     return World(c, physics, lanes.build(c.terrain), _settle_robots(c, physics))
 
 

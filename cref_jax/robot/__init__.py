@@ -14,6 +14,7 @@ from cref_jax.robot.model import (
     solve_sparsely,
     spec,
 )
+from cref_jax.robot.registry import fill_in
 
 __all__ = [
     "FRICTION",
@@ -24,6 +25,7 @@ __all__ = [
     "Robot",
     "Spheres",
     "add_force_sensors",
+    "fill_in",
     "load",
     "moving",
     "solve_sparsely",

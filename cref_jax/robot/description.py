@@ -26,6 +26,8 @@ class Description:
     nominal_pose: dict[str, float]
     """rad, q_0 of both sides by kind of joint; turns about x and z are mirrored on the right. 0 for
     kinds that are not named."""
+    hands: tuple[str, str]
+    """Outermost bodies of the left and the right arm, which a rail may catch."""
     legs: tuple[str, ...]
     """What the names of leg joints hold after their side, such as `hip`."""
     waist: tuple[str, ...]
@@ -46,6 +48,14 @@ class Description:
     """Links that may appear before the camera."""
     kept_clear: tuple[str, ...]
     """Links that touch the ground only when the robot has fallen."""
+    base_height: float
+    """m, the base above the soles in the nominal pose."""
+    base_above_ankles: float
+    """m, the same above the ankles (Table I)."""
+    fallen_below: float
+    """m, the base above the supporting ankles: lower, and the robot has fallen."""
+    feet_apart: float
+    """m, from ankle to ankle (Table I)."""
     camera: str = "depth_camera"
     """Site of the depth camera."""
     imu: str = "imu"

@@ -15,6 +15,7 @@ X2_ULTRA = Description(
         "shoulder_roll": 0.2,  # outward
         "elbow": -0.6,
     },
+    hands=("left_wrist_roll_link", "right_wrist_roll_link"),
     legs=("hip", "knee", "ankle"),
     waist=("waist",),
     base="pelvis",
@@ -25,4 +26,9 @@ X2_ULTRA = Description(
     ankle_x=("ankle_roll",),
     in_view=("hip_yaw", "knee", "ankle_roll", "elbow", "wrist_yaw", "wrist_roll"),
     kept_clear=("pelvis", "torso", "head_pitch", "hip_yaw"),
+    base_height=0.62,
+    base_above_ankles=0.55,  # Table I
+    # assumed: a foot comes down on a box of 40 cm when the pelvis is still 0.3 m above the box
+    fallen_below=0.15,
+    feet_apart=0.27,  # Table I
 )

@@ -41,7 +41,7 @@ class WholeBodySim:
         Raises:
             ConfigError: the ground needs too many boxes.
         """
-        self.config, self.ground = c, ground
+        self.config, self.ground = robot.fill_in(c), ground
         self.robot = robot.load(config.Robot(c.robot.name, actuated="all"))
         self.model = model = _build_spec(c, ground, self.robot, friction).compile()
         names = self.robot.joint_names

@@ -1,5 +1,6 @@
 """Eq. 1-3: what stands where, and in which frame."""
 
+import functools
 import math
 
 import jax
@@ -12,6 +13,7 @@ from cref_jax.env import observations
 
 JOINTS = 12
 CELL = 0.02  # m
+SCAN = functools.partial(config.Scan, base_height=0.62)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -83,14 +85,14 @@ def ground():
 def test_the_height_scan_of_a_step(ground):
     # base 0.72 m above the start; 0.72 - 0.62 = 0.1 over the ground, 0.1 - 0.15 = -0.05 over the
     # step; x runs slowly, y fast: (0.3, +-0.1), (0.8, +-0.1), (1.3, +-0.1)
-    c = config.Scan(x=(-0.5, 0.5, 3), y=(-0.1, 0.1, 2))
+    c = SCAN(x=(-0.5, 0.5, 3), y=(-0.1, 0.1, 2))
     found = observations.height_scan(ground, state()[0], c)
     np.testing.assert_allclose(found, [0.1, 0.1, 0.1, 0.1, -0.05, -0.05], atol=1e-6)
 
 
 def test_the_height_scan_turns_with_the_heading_and_not_with_the_tilt(ground):
     # heading along world y: the samples at y = -0.4 of the body lie at x = 0.8 + 0.4 of the world
-    c = config.Scan(x=(-0.5, 0.5, 2), y=(-0.4, 0.4, 2))
+    c = SCAN(x=(-0.5, 0.5, 2), y=(-0.4, 0.4, 2))
     heading = turned([0.0, 0.0, 1.0], 90.0)
     for tilt in (0.0, 25.0):
         rotation = geometry.quat_multiply(heading, turned([0.0, 1.0, 0.0], tilt))
@@ -100,7 +102,7 @@ def test_the_height_scan_turns_with_the_heading_and_not_with_the_tilt(ground):
 
 def test_the_height_scan_is_clipped(ground):
     # over the pit: 0.72 + 1 - 0.62 = 1.1, cut to 1
-    c = config.Scan(x=(1.5, 1.5, 1), y=(0.0, 0.0, 1))
+    c = SCAN(x=(1.5, 1.5, 1), y=(0.0, 0.0, 1))
     np.testing.assert_array_equal(observations.height_scan(ground, state()[0], c), [1.0])
 
 
@@ -116,7 +118,7 @@ def test_the_fine_row_places_a_riser_within_its_spacing():
     heights = np.where((np.arange(200) + 0.5) * 0.02 > 0.99, 0.2, 0.0)[:, None]
     ground = terrain.from_heights(heights, 0.02, (0.0, 0.0))
     qpos = jnp.zeros(19).at[:4].set(jnp.array([0.3, 0.0, 0.62, 1.0]))
-    found = observations.fine_row(ground, qpos, config.Scan())
+    found = observations.fine_row(ground, qpos, SCAN())
     np.testing.assert_allclose(found, [*[0.0] * 18, *[-0.2] * 7], atol=1e-6)
 
 

@@ -11,7 +11,7 @@ import pytest
 from cref_jax import config, robot
 from cref_jax.env import rewards
 
-C = config.Reward()
+C = robot.fill_in(config.Config()).reward
 PERIOD = 0.02  # s
 TABLE_1 = {
     "linear_velocity_tracking": 2.5,

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config
+from cref_jax import config, robot
 from cref_jax.config import Config
 from cref_jax.env import resets
 from cref_jax.env.state import EnvState
@@ -14,7 +14,7 @@ from cref_jax.env.world import World, make_world
 from cref_jax.physics.simulation import Physics
 
 C = config.override(
-    Config(),
+    robot.fill_in(Config()),
     {"terrain": {"name": "mixed", "levels": 3, "lane_width": 1.0}, "episode": {"bank_size": 8}},
 )
 ROBOTS = 8
