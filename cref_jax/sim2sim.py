@@ -18,7 +18,7 @@ from cref_jax import cli, deploy
 from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
-from cref_jax.evaluation import crossing, sim2sim_table
+from cref_jax.evaluation import crossing, protocol, sim2sim_table
 from cref_jax.evaluation.crossing import LaneResult
 from cref_jax.evaluation.protocol import TRIAL_SECONDS
 from cref_jax.physics.simulation import Physics
@@ -29,6 +29,7 @@ from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain.generators import KINDS
 from cref_jax.whole_body.disturbances import Disturbance
 from cref_jax.whole_body.ground import Lane
+from cref_jax.whole_body.randomization import Perturbation, sample_deviation
 from cref_jax.whole_body.simulator import WholeBodySim
 from cref_jax.whole_body.trial import Start, Trial, run_trial
 
@@ -51,6 +52,8 @@ class Options(cli.DebugOption):
     """seed of initial states and commands, the same as in `eval --suite cross`"""
     latency: float = 0.02
     """s from the exposure of a frame until the policy has it"""
+    randomised: bool = False
+    """vary the robot in each trial, with sensor noise and pushes, as `eval --suite robust` does"""
     compare: bool = False
     """also evaluate the same trials in the training simulation"""
     table: bool = False
@@ -134,7 +137,7 @@ def run_in_training(policy: TrainedPolicy, physics: Physics, options: Options) -
     """Run the same trials in the training simulation."""
     return crossing.cross(
         policy.config, physics, policy.train, options.kind, options.size, options.trials,
-        options.seed,
+        options.seed, randomised=options.randomised,
     )  # fmt: skip
 
 
@@ -142,26 +145,30 @@ def run_trials(world: World, path: Path, options: Options) -> list[Trial]:
     """Run the trials on all cores."""
     lanes = [to_lane(world, level) for level in range(world.lanes.levels)]
     _, levels = crossing.crossing_lanes(options.trials)
-    jobs = list(
-        zip(initial_states(world, options.seed, options.trials), levels.tolist(), strict=True)
-    )
-    return parallel.run(_Walker, (world.config, path, lanes, options.latency), jobs)
+    starts = initial_states(world, options.seed, options.trials)
+    jobs = list(zip(starts, levels.tolist(), range(options.trials), strict=True))
+    return parallel.run(_Walker, (world.config, path, lanes, options), jobs)
 
 
 class _Walker:
     """Runs trials of one policy; policy and models are built once."""
 
-    def __init__(self, c: Config, path: Path, lanes: list[Lane], latency: float) -> None:
+    def __init__(self, c: Config, path: Path, lanes: list[Lane], options: Options) -> None:
         self._contents = deploy.contents(path)
         joints = deploy.Policy(*self._contents).joints.names
         self._bodies = [WholeBodySim(c, lane, joints) for lane in lanes]
-        late = max(0, round(latency / c.physics.control_period))
+        late = max(0, round(options.latency / c.physics.control_period))
         self._disturbance = Disturbance(latency=late)
+        self._config, self._options = protocol.randomise(c), options
 
-    def __call__(self, job: tuple[Start, int]) -> Trial:
-        start, level = job
-        policy = deploy.Policy(*self._contents)
-        return run_trial(self._bodies[level], policy, start, TRIAL_SECONDS, self._disturbance)
+    def __call__(self, job: tuple[Start, int, int]) -> Trial:
+        start, level, number = job
+        policy, body, perturbation = deploy.Policy(*self._contents), self._bodies[level], None
+        if self._options.randomised:
+            rng = np.random.default_rng([self._options.seed, number])
+            body = body.deviate(sample_deviation(self._config, len(body.driven), rng))
+            perturbation = Perturbation(self._config, rng)
+        return run_trial(body, policy, start, TRIAL_SECONDS, self._disturbance, perturbation)
 
 
 def to_lane(world: World, level: int = 0) -> Lane:

@@ -50,9 +50,12 @@ def cross(
     count: int = 200,
     seed: int = 0,
     on_finished: Callable[[int], None] = lambda count: None,
+    randomised: bool = False,
 ) -> LaneResult:
     """Run trials of the policy's mean action on lanes with these obstacles."""
     world = crossing_world(c, physics, kind, size)
+    if randomised:
+        world = world.replace(config=protocol.randomise(world.config))
     specs = trials.TrialSpecs(np.arange(count), *crossing_lanes(count))
     outcomes = trials.run(
         world, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished

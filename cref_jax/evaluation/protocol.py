@@ -40,6 +40,11 @@ def trial_config(c: Config) -> Config:
     return evaluation_config(c, TRIAL_SECONDS)
 
 
+def randomise(c: Config) -> Config:
+    """Switch the randomisation on, with its default ranges, which are the same for all policies."""
+    return dataclasses.replace(c, randomisation=type(c.randomisation)())
+
+
 def robots_per_block() -> int:
     """Return the number of robots per device in trials; assumed: fills it."""
     return 100 if jax.default_backend() == "cpu" else 1000

@@ -3,7 +3,6 @@
 A trial's draws depend on the seed and the trial's number, like its start and command.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from cref_jax import config, ppo
+from cref_jax import ppo
 from cref_jax.config import Config
 from cref_jax.env.state import Spread
 from cref_jax.env.world import World
@@ -62,7 +61,7 @@ def row_world(c: Config, physics: Physics) -> World:
         for lane in of
     }
     w = tables.make_lane_world(c, physics, sized)
-    return w.replace(config=dataclasses.replace(w.config, randomisation=config.Randomisation()))
+    return w.replace(config=protocol.randomise(w.config))
 
 
 def run_rows(

@@ -6,7 +6,9 @@ policy on measured inputs. Its rules duplicate those of training on purpose, as 
 oracle; tests compare each pair.
 """
 
+import copy
 import math
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -14,7 +16,9 @@ from jaxtyping import Float
 
 from cref_jax import config, robot
 from cref_jax.config import Config
+from cref_jax.robot.registry import describe
 from cref_jax.whole_body.ground import GROUND, SEEN, UNSEEN, Ground
+from cref_jax.whole_body.randomization import Deviation
 
 FAR = 1e3  # m, length of the rays
 
@@ -50,6 +54,22 @@ class WholeBodySim:
         self.rays = _pixel_rays(c.camera)
         clear = np.array(self.robot.capsules.names)[self.robot.capsules.kept_clear]
         self.kept_clear = {model.geom(name).id for name in clear}
+        self.hands = [model.body(name).id for name in describe(c.robot.name).hands]
+        self.deviation = Deviation()
+
+    def deviate(self, by: Deviation) -> "WholeBodySim":
+        """Build the same simulator with a robot that differs from the nominal one."""
+        other = copy.copy(self)
+        other.deviation, other.model = by, copy.copy(self.model)
+        model, trunk = other.model, self.robot.trunk
+        if by.friction is not None:
+            model.geom_friction[:, 0] = by.friction
+        model.body_mass[trunk] += by.payload
+        model.body_ipos[trunk] += by.com_shift
+        model.actuator_gainprm[self.driven, 0] *= by.kp
+        model.actuator_biasprm[self.driven, 1] *= by.kp
+        model.actuator_biasprm[self.driven, 2] *= by.kd
+        return other
 
     def image(self, state: mujoco.MjData) -> Float[np.ndarray, "H W"]:
         """Render z-depth in metres by ray-cast, infinity where a ray hits nothing."""
@@ -57,10 +77,11 @@ class WholeBodySim:
         link = state.xmat[mount.body].reshape(3, 3)
         fixed = np.zeros(9)
         mujoco.mju_quat2Mat(fixed, mount.rotation.astype(float))
-        pitch = math.radians(camera.pitch)
+        pitch = math.radians(camera.pitch) + self.deviation.camera_pitch
         c, s = math.cos(pitch), math.sin(pitch)
         axes = np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])  # right, down, forward
-        position = state.xpos[mount.body] + link @ mount.position
+        mounted = mount.position + fixed.reshape(3, 3) @ self.deviation.camera_shift
+        position = state.xpos[mount.body] + link @ mounted
         world = self.rays @ (link @ fixed.reshape(3, 3) @ axes).T
         count = len(world)
         geom, distance = np.zeros(count, np.int32), np.zeros(count)
@@ -72,10 +93,17 @@ class WholeBodySim:
         depth = np.where(distance < 0.0, np.inf, distance * self.rays[:, 2])
         return depth.reshape(camera.shape).astype(np.float32)
 
-    def advance(self, state: mujoco.MjData) -> Float[np.ndarray, "2 3"]:
-        """Advance one control step; return the mean force on each foot, N, as in training."""
+    def advance(
+        self, state: mujoco.MjData, targets: Sequence[Float[np.ndarray, " J"]]
+    ) -> Float[np.ndarray, "2 3"]:
+        """Advance one control step; return the mean force on each foot, N, as in training.
+
+        `targets` are the policy's last one and its new one, rad, which the motors get late.
+        """
         substeps, force = self.config.physics.substeps, np.zeros((2, 3))
-        for _ in range(substeps):
+        for substep in range(substeps):
+            target = targets[substep >= self.deviation.delay]
+            state.ctrl[self.driven] = target - self.deviation.offset
             mujoco.mj_step(self.model, state)
             force += self.foot_force(state) / substeps
         mujoco.mj_forward(self.model, state)  # update poses and contacts to the new state

@@ -11,6 +11,7 @@ from cref_jax import config
 from cref_jax.config import Config
 from cref_jax.deploy import Policy, Status
 from cref_jax.whole_body.disturbances import UNDISTURBED, Channel, Disturbance
+from cref_jax.whole_body.randomization import Perturbation
 from cref_jax.whole_body.simulator import WholeBodySim
 from cref_jax.whole_body.termination import TerminationChecker
 
@@ -40,6 +41,7 @@ def run_trial(
     start: Start,
     seconds: float,
     disturbance: Disturbance = UNDISTURBED,
+    perturbation: Perturbation | None = None,
 ) -> Trial:
     """Run one trial until the robot falls, finishes, strays or stalls, or time is up.
 
@@ -49,11 +51,13 @@ def run_trial(
         start: initial pose and command.
         seconds: time limit.
         disturbance: camera faults.
+        perturbation: sensor noise and pushes.
     """
     c, period, latency = body.config, body.config.physics.control_period, disturbance.latency
     state = _initial_state(body, start)
     checker, channel = TerminationChecker(body, state, start.speed), Channel(disturbance)
     ending, status, path, speeds = None, Status.OK, [], []
+    before = body.robot.nominal_pose[body.driven]
     policy.reset()
     for t in range(round(seconds / period)):
         path.append(state.qpos.copy())
@@ -61,13 +65,15 @@ def run_trial(
             status |= policy.on_depth(*delivered)
         rotation = state.xmat[body.robot.pelvis].reshape(3, 3)
         command = lane_command(c.command, start.speed, state.qpos)
-        q, qd = state.qpos[7:][body.driven], state.qvel[6:][body.driven]
-        target = policy.step(state.qvel[3:6], -rotation[2], command, q, qd, t * period)
+        if perturbation:
+            perturbation.push(state, body.robot.mass, body.hands)
+        gyro, gravity, q, qd = _sense(body, state, perturbation)
+        target = policy.step(gyro, gravity, command, q, qd, t * period)
         status |= policy.status
         if not policy.blind and _is_due(t + latency, c) and not channel.loses_one():
             channel.send(body.image(state), t, t * period)
-        state.ctrl[body.driven] = target
-        force = body.advance(state)
+        force = body.advance(state, (before, target))
+        before = target
         speeds.append(float(rotation[:, 0] @ state.qvel[:3]))
         ending = checker.check(state, force)
         if ending:
@@ -103,6 +109,16 @@ def _initial_state(body: WholeBodySim, start: Start) -> mujoco.MjData:
     state.ctrl[:] = body.robot.nominal_pose
     mujoco.mj_forward(body.model, state)
     return state
+
+
+def _sense(
+    body: WholeBodySim, state: mujoco.MjData, perturbation: Perturbation | None
+) -> list[np.ndarray]:
+    """Measure angular velocity, gravity, and positions and velocities of the driven joints."""
+    rotation = state.xmat[body.robot.pelvis].reshape(3, 3)
+    q, qd = state.qpos[7:][body.driven], state.qvel[6:][body.driven]
+    clean = [state.qvel[3:6], -rotation[2], q + body.deviation.offset, qd]
+    return perturbation.measure(*clean) if perturbation else clean
 
 
 def _is_due(step: int, c: Config) -> bool:

@@ -116,7 +116,7 @@ def test_force_on_the_feet_is_that_of_training():
     target = jnp.tile(ROBOT.nominal_pose, (2, 1))
     step = jax.jit(physics.step)
     for _ in range(5):
-        ours = body.advance(state)
+        ours = body.advance(state, (ROBOT.nominal_pose, ROBOT.nominal_pose))
         theirs, force = step(ground, theirs, target, jnp.int32(0), physics.nominal_dynamics())
         np.testing.assert_allclose(ours, force, atol=0.05)
     assert ours[:, 2].min() > 50.0
