@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from cref_jax import ppo
-from cref_jax.config import Config
+from cref_jax.config import Config, override
 from cref_jax.env.state import Spread
 from cref_jax.env.world import World
 from cref_jax.evaluation import intervals, lateral_drift, paper_results, protocol, tables, trials
@@ -19,7 +19,11 @@ from cref_jax.evaluation.trials import Trials
 from cref_jax.physics.simulation import Physics
 
 EVERYTHING = "everything"
-PARTS = Spread._fields
+STRUCTURES = "structures"
+PARTS = (*Spread._fields, STRUCTURES)
+RAILS = {"structures": 8, "push_yaw_rate": 1.0}
+"""Capsules in the depth image, and rad/s that pushes turn the robot by, as of a wrist on a rail; as in
+experiments/robust.toml"""
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper_results.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs are not tested there
@@ -54,14 +58,14 @@ def obstacle_size(kind: str, level: str) -> float:
 
 
 def row_world(c: Config, physics: Physics) -> World:
-    """Build the world with the lanes of all rows and the default ranges of randomisation."""
+    """Build the world with the lanes of all rows and the ranges of randomisation."""
     sized = {
         lane: [obstacle_size(kind, at) for at in LEVELS]
         for kind, of in LANES.items()
         for lane in of
     }
     w = tables.make_lane_world(c, physics, sized)
-    return w.replace(config=protocol.randomise(w.config))
+    return w.replace(config=override(protocol.randomise(w.config), {"randomisation": RAILS}))
 
 
 def run_rows(
@@ -74,20 +78,40 @@ def run_rows(
 ) -> list[dict[str, Any]]:
     """Run `count` trials per row; `on_finished(n)` is called as trials end."""
     every = list(selected or list_rows())
+    bare = w.replace(config=override(w.config, {"randomisation": {"structures": 0}}))
+    found = {}
+    for world, parts in ((w, (EVERYTHING, STRUCTURES)), (bare, Spread._fields)):
+        rows = [row for row in every if row.part in parts]
+        if rows:
+            found |= dict(
+                zip(rows, _run_in(world, train, rows, count, seed, on_finished), strict=True)
+            )
+    return [found[row] for row in every]
+
+
+def _run_in(
+    w: World,
+    train: ppo.TrainState,
+    rows: Sequence[Row],
+    count: int,
+    seed: int,
+    on_finished: Callable[[int], None],
+) -> list[dict[str, Any]]:
+    """Run the rows that share a world."""
     on = [
         tables.round_robin_lanes(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
-        for row in every
+        for row in rows
     ]
     kind, level = map(np.concatenate, zip(*on, strict=True))
-    spread = jax.tree.map(lambda *x: np.repeat(x, count), *(_spread(row.part) for row in every))
+    spread = jax.tree.map(lambda *x: np.repeat(x, count), *(_spread(row.part) for row in rows))
     # same start, command and draws on a lane, whichever parts are randomised
-    number = np.tile(np.arange(count), len(every))
+    number = np.tile(np.arange(count), len(rows))
     specs = trials.TrialSpecs(number, kind, level, spread)
     outcomes = trials.run(
         w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
     )
     part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in outcomes))
-    return [_row_result(row, part(k)) for k, row in enumerate(every)]
+    return [_row_result(row, part(k)) for k, row in enumerate(rows)]
 
 
 def overall(results: Sequence[dict[str, Any]]) -> dict[str, float]:
@@ -138,8 +162,8 @@ def parts_table(results: Sequence[dict[str, Any]]) -> Table:
 
 def _spread(part: str) -> Spread:
     if part == EVERYTHING:
-        return Spread(*[np.float32(1.0)] * len(PARTS))
-    return Spread(*(np.float32(name == part) for name in PARTS))
+        return Spread(*[np.float32(1.0)] * len(Spread._fields))
+    return Spread(*(np.float32(name == part) for name in Spread._fields))
 
 
 def _row_result(row: Row, outcomes: Trials) -> dict[str, Any]:

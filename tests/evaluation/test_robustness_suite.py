@@ -1,13 +1,16 @@
 """What is asked with everything randomised and with each part alone, and how it is counted."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import small_world
 
 from cref_jax import ppo
 from cref_jax.config import Randomisation
+from cref_jax.env.state import Spread
 from cref_jax.evaluation import robustness_suite
-from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS
+from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS, STRUCTURES
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +21,7 @@ def world():
 def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():
     rows = robustness_suite.list_rows()
     whole = [row for row in rows if row.part == EVERYTHING]
-    assert len(whole) == 14 and len(rows) == 14 + 8 * 4
+    assert len(whole) == 14 and len(rows) == 14 + 9 * 4
     sizes = {(row.kind, robustness_suite.obstacle_size(row.kind, row.level)) for row in whole}
     assert {("gap", 0.90), ("platform", 0.45), ("stairs", 0.23)} < sizes
     for part in PARTS:
@@ -28,31 +31,33 @@ def test_every_cell_is_asked_with_everything_and_each_part_on_each_kind():
 
 
 def test_the_ranges_are_the_projects_own_whatever_a_policy_was_trained_with(world):
-    assert world.config.randomisation == Randomisation() and world.config.randomisation.enabled
-    assert not world.config.randomisation.ramp
+    ranges = dataclasses.replace(Randomisation(), structures=8, push_yaw_rate=1.0)
+    assert world.config.randomisation == ranges and ranges.enabled and not ranges.ramp
 
 
 def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
-    seen = []
+    seen = {}
 
     def run(w, walker, asked, seed, block, ended):
-        seen.append(asked)
+        seen[w.config.randomisation.structures] = asked
         one = np.ones(len(asked.number), np.float32)
         ending = (asked.number % 2).astype(int)
         return robustness_suite.Trials(one, ending, one, one, one, one)
 
     monkeypatch.setattr(robustness_suite.trials, "run", run)
     found = robustness_suite.run_rows(world, ppo.TrainState(*5 * [None]), 10, 0)
-    (asked,) = seen
+    place = dict.fromkeys(seen, 0)
     for k, row in enumerate(robustness_suite.list_rows()):
-        part = slice(10 * k, 10 * k + 10)
+        structures = 8 if row.part in (EVERYTHING, STRUCTURES) else 0
+        asked, first = seen[structures], place[structures]
+        part, place[structures] = slice(first, first + 10), first + 10
         names = {world.lanes.kinds[kind] for kind in asked.kind[part]}
         assert names == set(robustness_suite.LANES[row.kind])
         sizes = world.lanes.sizes[asked.level[part], asked.kind[part]]
         np.testing.assert_allclose(sizes, robustness_suite.obstacle_size(row.kind, row.level))
         shares = {name: set(of[part].tolist()) for name, of in asked.spread._asdict().items()}
         on = {name for name, share in shares.items() if share == {1.0}}
-        assert on == (set(PARTS) if row.part == EVERYTHING else {row.part})
+        assert on == (set(Spread._fields) if row.part == EVERYTHING else {row.part} - {STRUCTURES})
         assert all(share in ({0.0}, {1.0}) for share in shares.values())
         np.testing.assert_array_equal(asked.number[part], np.arange(10))
         assert (found[k]["part"], found[k]["trials"], found[k]["successes"]) == (row.part, 10, 5)
