@@ -22,8 +22,8 @@ EVERYTHING = "everything"
 STRUCTURES = "structures"
 PARTS = (*Spread._fields, STRUCTURES)
 RAILS = {"structures": 8, "push_yaw_rate": 1.0}
-"""Capsules in the depth image, and rad/s that pushes turn the robot by, as of a wrist on a rail; as in
-experiments/robust.toml"""
+"""Capsules in the depth image, and rad/s by which pushes turn the robot, as if a wrist caught on a
+rail; as in experiments/robust.toml"""
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper_results.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs are not tested there
