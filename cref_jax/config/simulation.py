@@ -43,6 +43,7 @@ class Terrain:
     lane_width: float = 4.0  # m; assumed
     levels: int = 10  # assumed: as legged_gym
     variants: int = 1  # lanes per level and kind, one drawn at each reset; assumed
+    slits: float = 0.0  # m, the widest across half of the lanes, as between planks; 0: none
     seed: int = 1  # of the random heights and landings
 
 

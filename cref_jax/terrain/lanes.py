@@ -17,6 +17,7 @@ from cref_jax.terrain import atlas, column_grid, heightmap, kind_files
 from cref_jax.terrain.atlas import Atlas
 from cref_jax.terrain.generators import KINDS, Heights, columns, find_level_places
 from cref_jax.terrain.kind_files import KindNumbers
+from cref_jax.terrain.slits import cut_slits
 
 
 def build(c: config.Terrain) -> Atlas:
@@ -33,7 +34,7 @@ def build(c: config.Terrain) -> Atlas:
     numbers = {kind: n._replace(shape=n.practice) for kind, n in numbers.items()}
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
     seeds = [c.seed + variant for variant in range(c.variants)] * c.levels
-    atlas = _build_atlas(c, numbers, np.repeat(sizes, c.variants, axis=0), seeds)
+    atlas = _build_atlas(c, numbers, np.repeat(sizes, c.variants, axis=0), seeds, c.slits)
     return atlas.replace(
         sizes=sizes, turns=kind_files.round_robin_kinds(c.name, atlas.kinds), variants=c.variants
     )
@@ -70,15 +71,20 @@ def named_sizes(c: config.Terrain, kind: str) -> dict[str, float]:
 
 
 def _build_atlas(
-    c: config.Terrain, numbers: dict[str, KindNumbers], sizes: np.ndarray, seeds: list[int]
+    c: config.Terrain,
+    numbers: dict[str, KindNumbers],
+    sizes: np.ndarray,
+    seeds: list[int],
+    slits: float = 0.0,
 ) -> Atlas:
-    """Build the lanes of each kind at its sizes [levels, kinds] and seeds."""
+    """Build the lanes of each kind at its sizes [levels, kinds] and seeds; `slits` in m."""
     size = columns(c.lane_length, c), columns(c.lane_width, c)
     stored, places, is_profile = [], [], []
     for k, (kind, n) in enumerate(numbers.items()):
         atlas.check_columns((size[0] * len(seeds), size[1]), f"'{kind}' of terrain '{c.name}'")
         drawn = [
-            _generate_lane(c, n.shape, kind, float(sizes[row, k]), s) for row, s in enumerate(seeds)
+            _generate_lane(c, n.shape, kind, float(sizes[row, k]), s, slits)
+            for row, s in enumerate(seeds)
         ]
         level_across = all((lane == lane[:, :1]).all() for lane in drawn)
         is_profile.append(level_across)
@@ -95,10 +101,13 @@ def _build_atlas(
     )
 
 
-def _generate_lane(c: config.Terrain, shape: Any, kind: str, size: float, seed: int) -> Heights:
+def _generate_lane(
+    c: config.Terrain, shape: Any, kind: str, size: float, seed: int, slits: float
+) -> Heights:
     """Generate one lane from seed, kind and size alone: it is the same in every mix."""
     rng = np.random.default_rng([seed, zlib.crc32(kind.encode()), round(1e4 * size)])
-    return KINDS[kind].heights(c, size, shape, rng)
+    heights = KINDS[kind].heights(c, size, shape, rng)
+    return cut_slits(heights, slits, c.cell, rng) if slits > 0.0 else heights
 
 
 def _check_lane(c: config.Terrain) -> None:

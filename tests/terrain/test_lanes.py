@@ -431,3 +431,29 @@ def test_a_file_that_is_no_map_is_refused(tmp_path):
 def test_a_picture_in_colour_is_refused(tmp_path):
     Image.new("RGB", (4, 4)).save(tmp_path / "hill.png")
     refused("must be grey", lanes.build, config.Terrain(name=str(tmp_path / "hill.png")))
+
+
+def test_half_of_the_lanes_of_training_have_slits_where_the_ground_is_level():
+    c = config.Terrain(name="stairs", variants=8, slits=0.04)
+    plain, cut = (lanes.build(dataclasses.replace(c, slits=s)) for s in (0.0, 0.04))
+    with_slits = 0
+    for at in itertools.product((0, 4, 9), range(2), range(8)):  # level, kind, variant
+        before, after = (np.asarray(a.tile(*at).heights[:, 0]) for a in (plain, cut))
+        depth = before - after
+        at = np.flatnonzero(depth)
+        with_slits += bool(at.size)
+        if not at.size:
+            continue
+        np.testing.assert_allclose(depth[at], 0.3, atol=1e-6)
+        # 1.5 m at the start and 1 m at the end stay whole; 2 columns are 4 cm
+        assert at[0] >= 75 and at[-1] < 550
+        assert {length for z, length in runs(depth) if z > 0.1} <= {CELL, 2 * CELL}
+        edges = np.flatnonzero(np.diff(before))
+        if edges.size:
+            assert np.abs(at[:, None] - edges).min() >= 3
+    assert 14 < with_slits < 34  # of 48
+
+
+def test_slits_are_of_training_alone():
+    a, b = (lanes.build_single(config.Terrain(slits=s), "gap", 0.5) for s in (0.0, 0.04))
+    np.testing.assert_array_equal(profile(a), profile(b))
