@@ -2,6 +2,7 @@
 
 import cref_jax.system.startup  # noqa: F401
 
+import contextlib
 import dataclasses
 import datetime
 import json
@@ -13,7 +14,7 @@ from typing import Annotated, Literal
 import jax
 import jax.numpy as jnp
 import tyro
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 from cref_jax import cli
 from cref_jax.config import Config, limits, presets
@@ -25,9 +26,10 @@ from cref_jax.physics.simulation import resolve_engine
 from cref_jax.policy import learner_file, sources, trained, warm_start
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain.kind_files import terrain_names
-from cref_jax.training import devices, iteration, run_dir, trainer
-from cref_jax.training.checkpoint import Checkpoints, lock
-from cref_jax.training.progress import Reporter
+from cref_jax.training import devices, iteration, processes, run_dir, trainer
+from cref_jax.training.checkpoint import Checkpoints
+from cref_jax.training.progress import Reporter, SilentReporter
+from cref_jax.training.run_lock import lock
 from cref_jax.training.trainer import Programs
 
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
@@ -58,6 +60,14 @@ class Options(cli.DebugOption):
     """where the program runs; gpu is an error without one"""
     devices: int | None = None
     """devices to shard the environments over (default: all; one per CPU core)"""
+    distributed: bool = False
+    """train together with the other processes that Slurm, Open MPI or Kubernetes started"""
+    coordinator: str | None = None
+    """host:port of process 0, where nothing starts the processes; with the next two"""
+    num_processes: int | None = None
+    """processes that train together"""
+    process_id: int | None = None
+    """number of this one, from 0"""
     run_dir: Path | None = None
     """folder of the run (default: runs/TERRAIN-EXPERIMENT-DATE)"""
     init: Path | None = None
@@ -84,8 +94,12 @@ class Command:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     is_program, arguments = arguments is None, sys.argv[1:] if arguments is None else arguments
-    with cli.one_line_errors("--debug" in arguments, is_program):
-        jax_setup.prepare([_options(arguments).engine])
+    with processes.ending_together(), cli.one_line_errors("--debug" in arguments, is_program):
+        asked = _options(arguments)
+        jax_setup.prepare([asked.engine])
+        others = asked.coordinator, asked.num_processes, asked.process_id
+        if asked.distributed or any(x is not None for x in others):
+            processes.join(*others)
         options, c = parse(arguments)
         if options.print_config:
             print(json.dumps(dataclasses.asdict(c), indent=2))
@@ -167,25 +181,32 @@ def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
     run = options.run_dir or run_dir.ROOT / _name(options)
     mesh = devices.choose_mesh(c, options.devices)
-    threads = max(parallel.cores() // mesh.size, 1)
+    threads = max(parallel.cores() // len(mesh.local_devices), 1)
     # what is wrong with the terrain is said before anything is written
-    world = jax.device_put(
-        build_world(c, options.engine, threads), NamedSharding(mesh, PartitionSpec())
-    )
-    with lock(run):
+    world = processes.replicate(build_world(c, options.engine, threads), mesh)
+    with lock(run) if processes.is_first() else contextlib.nullcontext():
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
-            run_dir.write_config(run, c)
-            run_dir.write_origin(run, first)
-            samples = c.run.num_envs * c.ppo.horizon
-            with Reporter(run, first, c.run.iterations, samples, options.tensorboard) as report:
+            with _open_reporter(run, c, first, options) as report:
                 report.say(_headline(run, c, options, first))
                 programs = Programs(world, mesh, report)
                 if first < c.run.iterations:
                     programs.get(min(c.run.chunk, c.run.iterations - first))
                 state = _first_state(world, mesh, steps, options)
                 state = trainer.run_chunks(world, state, steps, report, programs)
-        _summary(run, c, state, options)
+        processes.leave()
+        if processes.is_first():
+            _summary(run, c, state, options)
+
+
+def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Reporter | SilentReporter:
+    """Write the run's settings and origin, and open its log; the first process alone does."""
+    if not processes.is_first():
+        return SilentReporter()
+    run_dir.write_config(run, c)
+    run_dir.write_origin(run, first)
+    samples = c.run.num_envs * c.ppo.horizon
+    return Reporter(run, first, c.run.iterations, samples, options.tensorboard)
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
@@ -206,14 +227,17 @@ def _first_state(
     world: World, mesh: Mesh, steps: Checkpoints, options: Options
 ) -> iteration.RunState:
     """Build the first state: fresh, from --init, or of the newest checkpoint."""
-    state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
+    start = jax.jit(iteration.initial_state, static_argnames="mesh").lower(world, mesh).compile()
+    processes.wait_for_all()
+    state = start(world)
     if options.init:
         policy = sources.load(options.init, world)
         if _has_critic(options.init, world.config):
             average = jax.tree.map(jnp.copy, policy.train.average)  # the actor gives its own away
             learned = policy.train.replace(average=average, iteration=state.train.iteration)
-            return state.replace(train=learned)
-        return state.replace(train=warm_start.start_from_policy(state.train, policy))
+        else:
+            learned = warm_start.start_from_policy(state.train, policy)
+        return state.replace(train=processes.replicate(learned, mesh))
     if not options.resume:
         return state
     stored, here = steps.meta(), trainer.describe_sharding(state, mesh)
@@ -249,7 +273,8 @@ def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) 
     if options.evaluate and int(state.train.iteration) >= c.run.iterations:
         print("evaluating 100 episodes on flat ground ...", flush=True)
         physics = build_physics(c, options.engine)
-        one = jax.device_put(trained.with_averaged_actor(state.train), jax.devices()[0])
+        learned = trained.with_averaged_actor(processes.to_host(state.train))
+        one = jax.device_put(learned, jax.local_devices()[0])
         result = walking.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
     print(f'saved in {run}; next: make play ARGS="--run {run}"')

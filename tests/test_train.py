@@ -99,6 +99,11 @@ def state_of(folder: Path) -> list[np.ndarray]:
         (["--iterations", "-3"], "'run.iterations' must be at least 1"),
         (["--physics.timestep", "1.0"], "'physics.timestep' must be"),
         (["--resume", "--run-dir", "nowhere"], "nowhere is not a run"),
+        (["--num-processes", "2"], "give --coordinator, --num-processes and --process-id, or none"),
+        (
+            ["--coordinator", "a:1", "--num-processes", "2", "--process-id", "2"],
+            "--process-id must be 0 to 1, not 2",
+        ),
         (["--init", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
         (
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],

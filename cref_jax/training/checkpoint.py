@@ -7,7 +7,6 @@ listed and pruned here.
 """
 
 import contextlib
-import fcntl
 import hashlib
 import importlib.metadata
 import json
@@ -16,11 +15,10 @@ import os
 import platform
 import re
 import shutil
-import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -28,7 +26,7 @@ import orbax.checkpoint as ocp
 from jaxtyping import PyTree
 
 from cref_jax.errors import CheckpointError, DamagedCheckpoint
-from cref_jax.training import pytree_digest
+from cref_jax.training import processes, pytree_digest
 
 LOG = logging.getLogger(__name__)
 SCHEMA = 1  # to be incremented when an older program would misread a new step
@@ -52,7 +50,7 @@ class Checkpoints:
         self.keep = keep
         self._current_step = -1  # last written or restored by this run
         self._foreign: set[Path] = set()  # numbered directories already warned about
-        self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+        self._orbax = _open_orbax()
 
     def __enter__(self) -> "Checkpoints":
         return self
@@ -91,6 +89,9 @@ class Checkpoints:
             CheckpointError: writing failed, or the directory contains the steps of another run.
         """
         host = pytree_digest.on_host(carry)
+        if not processes.is_first():
+            self._current_step = iteration
+            return
         index = pytree_digest.describe(carry, host)
         if iteration == self._current_step and self._holds(iteration, index):
             return
@@ -279,65 +280,6 @@ class Checkpoints:
             LOG.warning("%s: continues, but not bit for bit: %s", step, changes)
 
 
-@contextlib.contextmanager
-def lock(directory: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold `run.lock` in `directory`, created if missing, so that no second run writes there.
-
-    The kernel frees the lock however its process dies. The pid and host in the file are for the
-    message, and for file systems without locks or shared with other hosts.
-
-    Raises:
-        CheckpointError: another run holds it, or the directory cannot be written.
-    """
-    path = Path(directory).absolute() / "run.lock"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+", encoding="utf-8")
-    except OSError as error:
-        raise CheckpointError(f"{path.parent}: cannot be written: {_first_line(error)}") from error
-    with file:
-        _take_lock(file, path)
-        try:
-            yield
-        finally:
-            file.truncate(0)  # not removed: a waiting run may have the file open
-
-
-def _take_lock(file: TextIO, path: Path) -> None:
-    """Lock `file` and write our pid and host into it."""
-    locks = True
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = False
-    except BlockingIOError:
-        held = True
-    except OSError:  # a file system without locks
-        locks = held = False
-    file.seek(0)
-    pid, _, host = file.read(1000).strip().partition(" ")
-    dead = host == socket.gethostname() and (locks or not _is_alive(pid))
-    if held or (host and not dead):
-        raise CheckpointError(
-            f"{path.parent}: in use by process {pid} on {host}; if it is dead, remove {path}"
-        )
-    if host:
-        LOG.warning("%s: taken over from process %s, which died", path, pid)
-    file.truncate(0)
-    file.write(f"{os.getpid()} {socket.gethostname()}\n")
-    file.flush()
-
-
-def _is_alive(pid: str) -> bool:
-    """Check whether a process with this pid runs on this host."""
-    try:
-        os.kill(int(pid), 0)
-    except (ProcessLookupError, ValueError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
 def _is_within(path: str, parts: Sequence[str] | None) -> bool:
     """Check whether `path` lies in one of `parts`; None means everything."""
     return parts is None or any(path == part or path.startswith(f"{part}/") for part in parts)
@@ -368,6 +310,17 @@ def _set_aside(path: Path) -> None:
     aside = path.with_name(f"{path.name}.aside-{time.time_ns()}")
     path.rename(aside)
     LOG.warning("%s set aside as %s", path, aside.name)
+
+
+def _open_orbax() -> ocp.Checkpointer:
+    """Open orbax so that it waits for no other process: each reads by itself, and one writes."""
+    number = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=number, active_processes={number}, barrier_sync_key_prefix=f"{number}"
+    )
+    options = ocp.CompositeOptions(multiprocessing_options=alone)
+    handler = ocp.CompositeCheckpointHandler(composite_options=options)
+    return ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _package_versions() -> dict[str, str]:

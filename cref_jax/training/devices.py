@@ -25,6 +25,8 @@ def choose_mesh(c: Config, requested: int | None = None) -> Mesh:
     """
     available, parts = jax.device_count(), c.ppo.minibatches
     even = [n for n in range(1, available + 1) if c.run.num_envs % (n * parts) == 0]
+    if jax.process_count() > 1:  # each has a part
+        requested = requested or available
     if requested is not None and requested not in even:
         raise ConfigError(
             f"--devices {requested}: {c.run.num_envs} robots in {parts} minibatches can be "
@@ -46,7 +48,7 @@ def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) 
         return 0
     needed = m.argument_size_in_bytes + m.temp_size_in_bytes
     needed += m.output_size_in_bytes - m.alias_size_in_bytes
-    stats = jax.devices()[0].memory_stats()  # None on a CPU
+    stats = jax.local_devices()[0].memory_stats()  # None on a CPU
     available = stats["bytes_limit"] if stats else _main_memory()
     needed *= 1 if stats else devices
     if needed > available:

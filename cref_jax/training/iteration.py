@@ -131,7 +131,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         "train/samples": samples.astype(jnp.float32),
         "train/randomisation": state.ramp.share,
     }
-    return state, log
+    return state, jax.lax.with_sharding_constraint(log, NamedSharding(mesh, P()))
 
 
 def partition(world: World) -> RunState:

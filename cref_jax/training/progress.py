@@ -103,6 +103,22 @@ class Reporter:
             self.say(f"{iteration}/{self._last}: {rate:,.0f} samples/s{left}; {figures}")
 
 
+class SilentReporter:
+    """Reports nothing: of several processes one alone does."""
+
+    def __enter__(self) -> "SilentReporter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def say(self, line: str) -> None:
+        """Say nothing."""
+
+    def chunk(self, first: int, log: Mapping[str, np.ndarray], seconds: float) -> None:
+        """Write nothing."""
+
+
 def _build_table(newest: Mapping[str, float]) -> Table:
     """Build the table of figures, and of level and falls by kind of terrain."""
     table = Table.grid(padding=(0, 2))

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from cref_jax.training import processes
+
 
 def digest(tree: PyTree) -> str:
     """Compute one SHA-256 over all paths, shapes, dtypes and bits of `tree`, to identify it."""
@@ -43,7 +45,7 @@ def fill_from(like: PyTree, arrays: dict[str, Any], name: str = "") -> PyTree:
 
 def on_host(tree: PyTree) -> dict[str, np.ndarray]:
     """Copy the leaves, by path, to numpy arrays; random keys as their bits."""
-    host = jax.device_get({path: _bits(leaf) for path, leaf in by_path(tree).items()})
+    host = processes.to_host({path: _bits(leaf) for path, leaf in by_path(tree).items()})
     return {path: np.asarray(leaf) for path, leaf in host.items()}
 
 
@@ -55,8 +57,11 @@ def put_like(array: np.ndarray, like: Any, impl: str) -> Any:
     if isinstance(like, np.ndarray | np.generic):
         return array
     leaf = jnp.array(array)  # a copy, because the state's buffers are donated
+    place = like.sharding if getattr(like, "committed", False) else None
+    if place is not None and not place.is_fully_addressable:  # other processes hold parts of it
+        leaf = jax.make_array_from_callback(array.shape, place, lambda part: array[part])
     typed = jax.random.wrap_key_data(leaf, impl=impl) if impl else leaf
-    return jax.device_put(typed, like.sharding if getattr(like, "committed", False) else None)
+    return typed if leaf.sharding == place else jax.device_put(typed, place)
 
 
 def empty_like(like: Any) -> np.ndarray:

@@ -10,9 +10,9 @@ from jax.sharding import Mesh
 from cref_jax import errors
 from cref_jax.env.world import World
 from cref_jax.system import interrupts
-from cref_jax.training import devices, iteration
+from cref_jax.training import devices, iteration, processes
 from cref_jax.training.checkpoint import Checkpoints
-from cref_jax.training.progress import Reporter
+from cref_jax.training.progress import Reporter, SilentReporter
 
 MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is systematic
 
@@ -20,7 +20,7 @@ MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is systema
 class Programs:
     """The compiled programs of chunks of iterations, by size."""
 
-    def __init__(self, world: World, mesh: Mesh, report: Reporter) -> None:
+    def __init__(self, world: World, mesh: Mesh, report: Reporter | SilentReporter) -> None:
         self._world, self.mesh, self._report = world, mesh, report
         self._shapes = iteration.state_shapes(world, mesh)
         self._compiled: dict[int, jax.stages.Compiled] = {}
@@ -40,10 +40,13 @@ class Programs:
             started_at = time.monotonic()
             lowered = iteration.chunk.lower(self._world, self._shapes, self.mesh, size)
             self._compiled[size] = lowered.compile()
+            processes.wait_for_all()
             if first:
                 seconds = time.monotonic() - started_at
                 robots = self._world.config.run.num_envs
-                needed = devices.check_memory(self._compiled[size], robots, self.mesh.size)
+                needed = devices.check_memory(
+                    self._compiled[size], robots, len(self.mesh.local_devices)
+                )
                 self._report.say(
                     f"compiled in {seconds:.0f} s; needs {needed / 2**30:.1f} GiB of memory; "
                     "Ctrl-C saves and stops"
@@ -55,7 +58,7 @@ def run_chunks(
     world: World,
     state: iteration.RunState,
     steps: Checkpoints,
-    report: Reporter,
+    report: Reporter | SilentReporter,
     programs: Programs,
 ) -> iteration.RunState:
     """Train chunk by chunk; save in between, at the end, and on a request to stop."""
@@ -65,8 +68,9 @@ def run_chunks(
         report.say(f"nothing left to do: {done} of {c.run.iterations} iterations are done")
         return state
     saved = time.monotonic()
+    stops = False
     with interrupts.StopRequest() as stop:
-        while done < c.run.iterations and not stop.requested:
+        while done < c.run.iterations and not stops:
             program = programs.get(min(c.run.chunk, c.run.iterations - done))
             started_at = time.monotonic()
             state, log = program(world, state)
@@ -74,17 +78,20 @@ def run_chunks(
             report.chunk(done, log, time.monotonic() - started_at)
             check_health(log, c.run.num_envs * c.ppo.horizon)
             done = int(state.train.iteration)
-            if time.monotonic() - saved > 60 * c.run.checkpoint_minutes:
+            is_due = time.monotonic() - saved > 60 * c.run.checkpoint_minutes
+            stops, is_due = processes.any_says(stop.requested, is_due)
+            if is_due:
                 _save(steps, state, done, programs.mesh)
                 saved = time.monotonic()
         _save(steps, state, done, programs.mesh)
-    if stop.requested:
+    if stops:
         report.say(f"stopped and saved at iteration {done}")
     return state
 
 
 def _save(steps: Checkpoints, state: iteration.RunState, done: int, mesh: Mesh) -> None:
     steps.save(done, state, describe_sharding(state, mesh))
+    processes.wait_for_all()
 
 
 def describe_sharding(state: iteration.RunState, mesh: Mesh) -> dict[str, int]:

@@ -75,8 +75,7 @@ def run_trial(
         force = body.advance(state, (before, target))
         before = target
         speeds.append(float(rotation[:, 0] @ state.qvel[:3]))
-        ending = checker.check(state, force)
-        if ending:
+        if ending := checker.check(state, force):
             break
     return Trial(
         ending=ending or "late",

@@ -21,7 +21,7 @@ import optax
 import pytest
 
 from cref_jax.errors import CheckpointError, DamagedCheckpoint
-from cref_jax.training import checkpoint, pytree_digest
+from cref_jax.training import checkpoint, pytree_digest, run_lock
 from cref_jax.training.checkpoint import Checkpoints
 
 # A read that fails leaves threads of orbax behind that complain of a closed loop.
@@ -366,8 +366,8 @@ with Checkpoints(sys.argv[1]) as checkpoints:
 def test_a_directory_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     run = tmp_path / "file" / "run"
-    with pytest.raises(CheckpointError, match="file/run: cannot be written: NotADirectory"):
-        checkpoint.lock(run).__enter__()
+    with pytest.raises(CheckpointError, match="file/run: cannot be written: Not a directory"):
+        run_lock.lock(run).__enter__()
     text = "run/1: could not be written: NotADirectory"
     with Checkpoints(run) as checkpoints, pytest.raises(CheckpointError, match=text):
         checkpoints.save(1, state(), META)
@@ -403,19 +403,19 @@ with Checkpoints(sys.argv[1]) as checkpoints:
 
 
 def test_two_runs_do_not_share_a_directory(tmp_path):
-    with checkpoint.lock(tmp_path):
+    with run_lock.lock(tmp_path):
         text = f"in use by process {os.getpid()} on {socket.gethostname()}"
-        with pytest.raises(CheckpointError, match=text), checkpoint.lock(tmp_path):
+        with pytest.raises(CheckpointError, match=text), run_lock.lock(tmp_path):
             pass
-    with checkpoint.lock(tmp_path):
+    with run_lock.lock(tmp_path):
         pass
 
 
 def test_the_lock_of_a_killed_run_is_taken_over(tmp_path, caplog):
     code = """
 import sys, time
-from cref_jax.training import checkpoint
-with checkpoint.lock(sys.argv[1]):
+from cref_jax.training import run_lock
+with run_lock.lock(sys.argv[1]):
     print("locked", flush=True)
     time.sleep(60)
 """
@@ -423,11 +423,11 @@ with checkpoint.lock(sys.argv[1]):
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE)
     assert process.stdout is not None and process.stdout.readline() == "locked\n"
     with pytest.raises(CheckpointError, match=f"process {process.pid} "):
-        checkpoint.lock(tmp_path).__enter__()
+        run_lock.lock(tmp_path).__enter__()
     process.kill()
     process.wait()
     caplog.set_level(logging.WARNING)
-    with checkpoint.lock(tmp_path):
+    with run_lock.lock(tmp_path):
         assert (tmp_path / "run.lock").read_text().startswith(f"{os.getpid()} ")
     assert f"taken over from process {process.pid}" in caplog.text
 
@@ -435,7 +435,7 @@ with checkpoint.lock(sys.argv[1]):
 def test_the_lock_of_another_host_is_left_alone(tmp_path):
     (tmp_path / "run.lock").write_text("17 elsewhere\n")
     with pytest.raises(CheckpointError, match=r"process 17 on elsewhere; if it is dead, remove"):
-        checkpoint.lock(tmp_path).__enter__()
+        run_lock.lock(tmp_path).__enter__()
 
 
 def test_equal_digests_mean_equal_bits():
