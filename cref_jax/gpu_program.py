@@ -11,7 +11,6 @@ import cref_jax.system.startup  # noqa: F401
 
 import collections
 import dataclasses
-import importlib.util
 import os
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -34,6 +33,7 @@ from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Backend, Body
 from cref_jax.physics.simulation import Physics
+from cref_jax.system import jax_setup
 from cref_jax.terrain import lanes
 from cref_jax.training import iteration
 
@@ -134,7 +134,7 @@ def prepare() -> None:
     Raises:
         ConfigError: the plugin is not installed.
     """
-    if not any(importlib.util.find_spec(f"jax_cuda{n}_plugin") for n in (12, 13)):
+    if not jax_setup.has_cuda_plugin():
         raise ConfigError("compiling for a GPU needs JAX's plugin: pip install 'cref-jax[cuda12]'")
     os.environ.setdefault("XLA_FLAGS", "--xla_gpu_force_compilation_parallelism=1")  # memory
     jax.config.update("jax_platforms", "cpu")  # the plugin compiles without a device

@@ -164,11 +164,17 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
     """Choose where the program runs, before JAX is used for the first time.
 
     Raises:
-        ConfigError: a GPU is asked for and JAX has none.
+        ConfigError: a GPU is asked for, or its plugin installed, and JAX has none.
     """
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
+    is_chosen = jax.config.jax_platforms == "cpu"  # here, or by JAX_PLATFORMS
     backend = jax.default_backend()
+    if backend != "gpu" and not is_chosen and jax_setup.has_cuda_plugin():
+        raise ConfigError(
+            "JAX's CUDA plugin is installed and finds no GPU: see whether nvidia-smi does, and "
+            "whether its driver is 525 or newer (cuda12), 580 (cuda13); --device cpu trains without"
+        )
     if device == "gpu" and backend != "gpu":
         raise ConfigError(
             "--device gpu: JAX has no GPU here; install its plugin with: "

@@ -155,6 +155,20 @@ def test_settings_come_from_defaults_then_device_then_experiment_then_command_li
     assert (c.ppo.epochs, c.run.num_envs) == (7, 16)
 
 
+def test_a_plugin_that_finds_no_gpu_is_no_silent_run_on_the_cpu(monkeypatch):
+    monkeypatch.setattr(train.jax_setup, "has_cuda_plugin", lambda: True)
+    chosen = train.jax.config.jax_platforms
+    try:
+        train.jax.config.update("jax_platforms", None)
+        for device in ("auto", "gpu"):
+            with pytest.raises(ConfigError, match="plugin is installed and finds no GPU"):
+                train.select_device(device)
+        assert train.select_device("cpu") == "cpu"
+        assert train.select_device("auto") == "cpu"  # JAX_PLATFORMS=cpu, as this sets
+    finally:
+        train.jax.config.update("jax_platforms", chosen)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["blind", "full"])
 def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, variant: str):

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import importlib.util
 import os
 import sys
 from collections.abc import Iterable
@@ -23,6 +24,11 @@ def prepare(engines: Iterable[str] = ()) -> None:
     if "mjx" in engines:
         _spare_threads()
     _keep_memory()
+
+
+def has_cuda_plugin() -> bool:
+    """Check whether JAX's plugin for NVIDIA's GPUs is installed, with or without a driver."""
+    return any(importlib.util.find_spec(f"jax_cuda{n}_plugin") for n in (12, 13))
 
 
 def _use_wide_registers() -> None:
