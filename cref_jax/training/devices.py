@@ -2,6 +2,8 @@
 
 import contextlib
 import os
+import resource
+import sys
 from pathlib import Path
 
 import jax
@@ -38,7 +40,8 @@ def choose_mesh(c: Config, requested: int | None = None) -> Mesh:
 def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) -> int:
     """Compute the bytes that a program needs per device, including its arguments.
 
-    The `devices` of a CPU share one memory: there, the sum over all of them.
+    The `devices` of a CPU share one memory: there, the sum over all of them and what the process
+    holds already.
 
     Raises:
         ConfigError: the memory is smaller.
@@ -50,14 +53,26 @@ def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) 
     needed += m.output_size_in_bytes - m.alias_size_in_bytes
     stats = jax.local_devices()[0].memory_stats()  # None on a CPU
     available = stats["bytes_limit"] if stats else _main_memory()
+    held = 0 if stats else _resident_memory()
     needed *= 1 if stats else devices
-    if needed > available:
-        fits = num_envs * available // needed
+    if held + needed > available:
+        fits = num_envs * max(available - held, 0) // needed
+        needed += held
         raise ConfigError(
             f"{num_envs} robots need {needed / 2**30:.1f} GiB and the device has "
             f"{available / 2**30:.1f}; use --num-envs {2 ** max(fits.bit_length() - 1, 0)}"
         )
-    return needed
+    return held + needed
+
+
+def _resident_memory() -> int:
+    """Read the memory that this process holds, bytes; the most so far where Linux is not asked."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return most if sys.platform == "darwin" else 1024 * most
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _main_memory() -> int:

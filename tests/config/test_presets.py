@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import jax
+import numpy as np
 import pytest
 
 from cref_jax.config import presets
@@ -27,14 +28,24 @@ def program(arguments, temporary, output=0, alias=0):
 
 def test_memory_is_what_goes_in_what_comes_out_and_what_lies_between(monkeypatch):
     monkeypatch.setattr(devices, "_main_memory", lambda: 64 * GIB)
-    # the output takes the place of the state that went in
-    assert devices.check_memory(program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB), 4096) == 8 * GIB
+    monkeypatch.setattr(devices, "_resident_memory", lambda: 2 * GIB)
+    # the output takes the place of the state that went in; the process holds 2 GiB without it
+    two = program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB)
+    assert devices.check_memory(two, 4096) == 2 * GIB + 8 * GIB
+    assert devices.check_memory(two, 4096, 2) == 2 * GIB + 16 * GIB
+
+
+def test_what_the_process_holds_is_what_it_took():
+    before = devices._resident_memory()
+    taken = np.ones(200 * 2**20, np.uint8)
+    assert devices._resident_memory() - before == pytest.approx(taken.nbytes, rel=0.05)
 
 
 def test_too_many_robots_are_refused_with_a_number_that_fits(monkeypatch):
-    monkeypatch.setattr(devices, "_main_memory", lambda: 6 * GIB)
-    # 4096 x 6 / 8 = 3072 would fit; the power of two below it is 2048
-    with pytest.raises(ConfigError, match=r"need 8.0 GiB and the device has 6.0; .* 2048"):
+    monkeypatch.setattr(devices, "_main_memory", lambda: 8 * GIB)
+    monkeypatch.setattr(devices, "_resident_memory", lambda: 2 * GIB)
+    # 4096 x (8 - 2) / 8 = 3072 would fit; the power of two below it is 2048
+    with pytest.raises(ConfigError, match=r"need 10.0 GiB and the device has 8.0; .* 2048"):
         devices.check_memory(program(3 * GIB, 5 * GIB), 4096)
 
 
