@@ -23,7 +23,8 @@ pack() {
   local pip="$root/.venv/bin/python -m pip --disable-pip-version-check"
   [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
   for name in $PACKAGES; do
-    version=$($pip show "$name" 2>/dev/null | awk '/^Version:/ { print $2 }')
+    version=$({ $pip show "$name" 2>/dev/null || true; } | awk '/^Version:/ { print $2 }')
+    : "${version:=$(sed -n "s/^$name==//p" "$root/constraints-py${python/./}.txt" 2>/dev/null)}"
     wanted+=("$name${version:+==$version}")
   done
   mkdir -p "$folder"
