@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from cref_jax import config
 from cref_jax.config import folders
 from cref_jax.errors import ConfigError
+from cref_jax.terrain import map_files
 from cref_jax.terrain.generators import KINDS, Range
 
 
@@ -109,7 +110,7 @@ def read_kind(c: config.Terrain, kind: str) -> KindNumbers:
     if kind not in KINDS:
         raise ConfigError(config.describe_unknown("kind", kind, list(KINDS)))
     for name in [c.name, "mixed", *terrain_names()]:
-        numbers = {} if Path(name).suffix in (".npy", ".png") else read_kinds(name)
+        numbers = {} if map_files.is_map(name) else read_kinds(name)
         if kind in numbers:
             return numbers[kind]
     raise ConfigError(f"neither '{c.name}' nor any file in terrains/ has the kind '{kind}'")

@@ -13,7 +13,7 @@ import numpy as np
 
 from cref_jax import config
 from cref_jax.errors import ConfigError
-from cref_jax.terrain import atlas, column_grid, heightmap, kind_files
+from cref_jax.terrain import atlas, column_grid, heightmap, kind_files, map_files
 from cref_jax.terrain.atlas import Atlas
 from cref_jax.terrain.generators import KINDS, Heights, columns, find_level_places
 from cref_jax.terrain.kind_files import KindNumbers
@@ -27,7 +27,7 @@ def build(c: config.Terrain) -> Atlas:
         ConfigError: no such terrain, or an unusable file.
     """
     path = Path(c.name)
-    if path.suffix in (".npy", ".png"):
+    if map_files.is_map(c.name):
         return heightmap.read_map(path)
     _check_lane(c)
     numbers = kind_files.read_kinds(c.name)
@@ -116,3 +116,5 @@ def _check_lane(c: config.Terrain) -> None:
         raise ConfigError(
             "a terrain's cell, lane_length, lane_width, levels and variants must be above zero"
         )
+    if c.cell < atlas.LEAST_CELL:
+        raise ConfigError(f"'terrain.cell' must be at least {atlas.LEAST_CELL} m, not {c.cell}")

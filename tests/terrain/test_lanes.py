@@ -381,7 +381,7 @@ def test_lanes_without_length_are_refused():
 
 
 def test_a_grid_too_large_for_memory_is_refused(tmp_path):
-    refused("more than 2e+08", lanes.build, config.Terrain(name="mixed", cell=0.001))
+    refused("more than 2e+08", lanes.build, config.Terrain(name="mixed", lane_length=9e3))
     wide = np.broadcast_to(np.float32(0.0), (20_000, 10_001))
     header = np.lib.format.open_memmap(tmp_path / "hill.npy", "w+", np.float32, wide.shape)
     del header
@@ -412,7 +412,7 @@ def test_a_height_map_needs_its_settings_beside_it(tmp_path):
         write_map(tmp_path, np.zeros((9, 9)), "cell = 1"),
     )
     refused(
-        "cell must be above zero",
+        "cell must be at least 0.01 m, not 0.0: contact looks three cells far",
         lanes.build,
         write_map(tmp_path, np.zeros((9, 9)), "cell = 0\nstart = [0, 0]"),
     )
