@@ -24,7 +24,9 @@ from cref_jax.evaluation import walking
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.policy import learner_file, sources, trained, warm_start
+from cref_jax.rendering import map_plot
 from cref_jax.system import jax_setup, parallel
+from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import devices, iteration, processes, run_dir, trainer
 from cref_jax.training.checkpoint import Checkpoints
@@ -122,6 +124,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         run = options.run_dir or run_dir.newest()
         base = run_dir.read_config(run)
         _check_resumed(run, base, options, arguments)
+        run_dir.check_map(run, base.terrain.name)
         options = dataclasses.replace(options, run_dir=run)
     else:
         base = presets.build_config(options.terrain, options.experiment, options.device)
@@ -195,6 +198,9 @@ def train(options: Options, c: Config) -> None:
             first = _first_iteration(steps, options.resume, run)
             with _open_reporter(run, c, first, options) as report:
                 report.say(_headline(run, c, options, first))
+                if processes.is_first() and map_files.is_map(c.terrain.name):
+                    map_plot.draw_map(world.lanes.tile(0, 0), run / "map.png")
+                    report.say(f"the map, with the start: {run / 'map.png'}")
                 programs = Programs(world, mesh, report)
                 if first < c.run.iterations:
                     programs.get(min(c.run.chunk, c.run.iterations - first))
@@ -210,7 +216,7 @@ def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Report
     if not processes.is_first():
         return SilentReporter()
     run_dir.write_config(run, c)
-    run_dir.write_origin(run, first)
+    run_dir.write_origin(run, first, c.terrain.name)
     samples = c.run.num_envs * c.ppo.horizon
     return Reporter(run, first, c.run.iterations, samples, options.tensorboard)
 

@@ -1,5 +1,6 @@
 """The numbers in a user's map: .npy, .png or .tif, with what a survey leaves out refused."""
 
+import hashlib
 import struct
 from pathlib import Path
 
@@ -31,6 +32,13 @@ def is_map(name: str) -> bool:
     if suffix in FOREIGN:
         raise ConfigError(f"{name}: a map is .npy, .png or .tif, not {suffix}")
     return suffix in SUFFIXES
+
+
+def digest(path: Path) -> str:
+    """Compute the SHA-256 of a map and the TOML file beside it."""
+    total = hashlib.sha256(path.read_bytes())
+    total.update(path.with_suffix(".toml").read_bytes())
+    return total.hexdigest()
 
 
 def read_values(path: Path) -> Values:

@@ -23,6 +23,7 @@ import jax
 from cref_jax import config
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
+from cref_jax.terrain import map_files
 from cref_jax.training.checkpoint import Checkpoints
 
 ROOT = Path("runs")
@@ -33,10 +34,10 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path, iteration: int = 0) -> None:
+def write_origin(run: Path, iteration: int = 0, terrain: str = "") -> None:
     """Append a line with the origin of this start: versions, device, command and git state.
 
-    `iteration` is the number of iterations done before it.
+    `iteration` is the number of iterations done before it, `terrain` a name or a map's file.
     """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -45,6 +46,7 @@ def write_origin(run: Path, iteration: int = 0) -> None:
         "python": platform.python_version(),
         **machine(),
         "git": _git_state(),
+        **({"map": map_files.digest(Path(terrain))} if map_files.is_map(terrain) else {}),
         **versions(),
     }
     with (run / "origin.jsonl").open("a") as file:
@@ -82,12 +84,30 @@ def read_config(run: Path) -> Config:
         raise ConfigError(f"{path}: {error}") from None
 
 
+def check_map(run: Path, terrain: str) -> None:
+    """Refuse a map that is not the one the run began on.
+
+    Raises:
+        ConfigError: the map or its settings have changed.
+    """
+    began_on = _first_origin(run).get("map")
+    if began_on and map_files.is_map(terrain) and map_files.digest(Path(terrain)) != began_on:
+        raise ConfigError(
+            f"{terrain} or the .toml beside it has changed since {run} began; begin a new run on "
+            f"it with --init {run}"
+        )
+
+
+def _first_origin(run: Path) -> dict[str, Any]:
+    try:
+        return json.loads((run / "origin.jsonl").read_text().splitlines()[0])
+    except (OSError, ValueError, IndexError):
+        return {}
+
+
 def first_option(run: Path, name: str) -> str | None:
     """Read an option from the command line that began a run, None if it was not given."""
-    try:
-        command = json.loads((run / "origin.jsonl").read_text().splitlines()[0])["command"]
-    except (OSError, ValueError, IndexError, KeyError):
-        return None
+    command = _first_origin(run).get("command", [])
     for word, following in zip(command, [*command[1:], ""], strict=True):
         if word == f"--{name}":
             return following
