@@ -20,7 +20,6 @@ import enum
 import hashlib
 import io
 import json
-import math
 import os
 import re
 import sys
@@ -51,15 +50,6 @@ _NPY = re.compile(
     rb"'shape': \((?P<shape>[0-9, ]{0,99})\), \}",
     re.DOTALL,
 )
-UPRIGHT = -0.5  # largest z of gravity, 60 deg of tilt; walking stays below -0.9
-MOST_TURNING = 12.0  # rad/s; walking with pushes stays below 6
-MOST_JOINT_SPEED = 50.0  # rad/s; walking with noise stays below 25
-LEAST_SEEN = 0.05  # share of pixels nearer than d_max; walking shows half and more
-NEAREST_GROUND = 0.35  # m, median of the picture's lower sixth; walking shows 0.64 and more
-UPSIDE_DOWN = 0.3  # m, by which the lower third is farther than the upper; upright it is nearer
-STOP_AFTER = 0.5  # s without a usable frame; a step at 0.8 m/s
-FROZEN_FRAMES = 10  # equal frames, one after another
-FROZEN_MOTION = 0.05  # rad, of a joint meanwhile; a simulated robot that stands sees no change
 POSE_MARGIN = 0.5  # rad beyond a joint's range; more means degrees, or another joint's angle
 LATE = 2.0  # control periods between two steps, at most
 
@@ -84,51 +74,9 @@ class Status(enum.IntFlag):
     LATE = 512  # the previous step is too long ago, or the clock went back
     HOLDING = 1024  # the last good target was returned again
     DAMPING = 2048  # the target is the measured pose, until `reset`
-    GRAVITY_TURNED = 4096  # gravity is 60 deg and more from the base's -z: the network was not run
-    GYRO_TOO_FAST = 8192  # no robot that walks turns so fast: the network was not run
-    JOINTS_TOO_FAST = 16384  # no joint of a robot that walks is so fast: the network was not run
-    SEES_NOTHING = 32768  # hardly a pixel is nearer than d_max: the frame was not used
-    SEES_TOO_NEAR = 65536  # the ground is nearer than the robot's legs are long: not used
-    CAMERA_TURNED = 131072  # the frame's upper part is nearer than its lower: not used
-    FROZEN_DEPTH = 262144  # the same frame again and again: not used
-    STOPPED = 1048576  # no usable frame for half a second: the command is taken as zero
-    NOT_STARTED = 524288  # no input was good yet: the target is the pose measured first
 
 
-FAULTS = (
-    Status.BAD_INPUT
-    | Status.BAD_ACTION
-    | Status.GRAVITY_TURNED
-    | Status.GYRO_TOO_FAST
-    | Status.JOINTS_TOO_FAST
-)
-WHY = {
-    Status.NO_DEPTH: "no usable frame has come since the reset",
-    Status.STALE_DEPTH: "the newest usable frame is too old, or its stamp is of another clock",
-    Status.BAD_DEPTH: "a frame cannot be read",
-    Status.INVALID_DEPTH: "too many pixels of a frame are 0 or NaN",
-    Status.BAD_INPUT: "an input cannot be used",
-    Status.BAD_ACTION: "the network's answer is not finite: an input is far from all training",
-    Status.COMMAND_LIMITED: "the command is outside the trained range and was clipped",
-    Status.RATE_LIMITED: "a target moved further than its motor can turn the joint in a step",
-    Status.RANGE_LIMITED: "a target was too far beyond its joint's range",
-    Status.LATE: "steps do not come at the control rate, or `now` is not in seconds",
-    Status.HOLDING: "the last good target is held",
-    Status.DAMPING: "the target is the measured pose until reset(): only damping acts",
-    Status.GRAVITY_TURNED: "gravity must be near (0, 0, -1) when the robot is upright: it has "
-    "fallen, or a sign (an accelerometer at rest shows the opposite), axis or frame is wrong",
-    Status.GYRO_TOO_FAST: "angular velocity is beyond what a robot does: deg/s in place of rad/s?",
-    Status.JOINTS_TOO_FAST: "joint speeds are beyond what a robot does: deg/s in place of rad/s?",
-    Status.SEES_NOTHING: "hardly a pixel is nearer than d_max: the camera is covered or looks "
-    "away, or its raw unit is smaller than taken (load(..., depth_scale=1e-4) for 0.1 mm)",
-    Status.SEES_TOO_NEAR: "the ground seems nearer than the legs are long: something covers the "
-    "camera, or the frame's unit is larger than taken",
-    Status.CAMERA_TURNED: "the ground is nearer at the frame's top than at its bottom: the camera, "
-    "or the order of its rows, is upside down",
-    Status.FROZEN_DEPTH: "the camera sends the same frame again and again",
-    Status.STOPPED: "without a usable frame for half a second the robot is told to stand",
-    Status.NOT_STARTED: "no good input has come yet: the pose measured first is held",
-}
+FAULTS = Status.BAD_INPUT | Status.BAD_ACTION
 
 
 class Joints(NamedTuple):
@@ -144,27 +92,18 @@ class Joints(NamedTuple):
     effort: np.ndarray  # N m
 
 
-def load(
-    path: str | os.PathLike[str],
-    joints: Sequence[str] | None = None,
-    depth_scale: float = 1e-3,
-) -> Policy:
+def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> Policy:
     """Load the policy in a directory, or in a .zip of one.
 
     Args:
         path: output of `python -m cref_jax.export`.
         joints: names of the robot's joints in its own order, which must equal the policy's.
-        depth_scale: m per unit of a camera's raw (uint16) values; a D435i's is 1e-3, others'
-            (D405, L515) 1e-4 or 2.5e-4.
 
     Raises:
         PolicyFormatError: a file is missing, damaged or of another format, or the joints differ.
     """
-    if not 1e-6 <= depth_scale <= 1.0:
-        raise PolicyFormatError(f"depth_scale must be 1e-6 to 1 m per unit, not {depth_scale}")
     with _one_error(path):
         policy = Policy(*contents(path))
-    policy.depth_scale = depth_scale
     if joints is not None and tuple(joints) != policy.joints.names:
         ours, theirs = ", ".join(policy.joints.names), ", ".join(map(str, joints))
         raise PolicyFormatError(f"{path}: its joints are {ours}, but the robot's are {theirs}")
@@ -195,7 +134,6 @@ class Policy:
         self.period = 1.0 / root.table("rates").real("control_hz", 1.0, 1000.0)  # s
         self.blind = net.text("variant", VARIANTS) == "blind"
         self.status = Status.OK
-        self.depth_scale = 1e-3  # m per unit of uint16
         size = 9 + 3 * len(self.joints.names)
         if [term.text("name") for term in obs.tables("terms")] != list(TERMS):
             raise PolicyFormatError(f"observation.terms must be {', '.join(TERMS)}")
@@ -229,20 +167,11 @@ class Policy:
         """Clear all memory: call before the first step, and to walk again after damping."""
         with self._lock:
             self._stamp: float | None = None
-            self._frame: np.ndarray | None = None  # the newest, as it came
-            self._frame_q = self.joints.default  # rad, joint angles when it came first
-            self._repeats = 0  # how often it has come again
-            self._way_up = False  # a frame has shown the camera to be the right way up
-            self._seen = Status.OK  # of the newest frame
             self._actor.reset()
         self._previous = np.zeros(len(self.joints.names), np.float32)
         self._before: float | None = None  # time of the last step, s
         self._aimed = False  # a target has been given
-        self._first: np.ndarray | None = None  # pose measured first, rad
-        self._sighted: float | None = None  # time of the newest usable frame, or of the start, s
-        self._stopped = False
-        self._detail = ""  # what is wrong with which input
-        self._faults = 0  # steps in a row without a good input
+        self._faults = self._hold_steps  # nothing to hold yet
         self._damping = False
         self.status = Status.OK
 
@@ -254,8 +183,7 @@ class Policy:
         holes, filled in from their surroundings.
         """
         with np.errstate(all="ignore"):
-            self._seen = self._see(depth, stamp)
-        return self._seen
+            return self._see(depth, stamp)
 
     def step(
         self,
@@ -277,30 +205,17 @@ class Policy:
             now: the time, s.
         """
         with np.errstate(all="ignore"):
-            if not self._seen:
-                self._detail = ""
-            status = self._time(now)
-            status |= self._sense((angular_velocity, gravity, command, q, qd))
+            status = self._sense((angular_velocity, gravity, command, q, qd)) | self._time(now)
             if not status & FAULTS:
                 status |= self._act()
         self._faults = self._faults + 1 if status & FAULTS else 0
-        self._damping |= self._aimed and self._faults > self._hold_steps
-        if not self._aimed:
-            status |= Status.NOT_STARTED | Status.DAMPING
-        elif self._damping:
+        self._damping |= self._faults > self._hold_steps
+        if self._damping:
             status |= Status.DAMPING
         elif self._faults:
             status |= Status.HOLDING
-        self.status = status | self._seen
-        if not self._aimed:
-            return (self.joints.default if self._first is None else self._first).copy()
+        self.status = status
         return (self._q if self._damping else self._target).copy()
-
-    @property
-    def why(self) -> str:
-        """What `status` says, in words."""
-        said = [words for flag, words in WHY.items() if flag & self.status]
-        return "; ".join([*said, self._detail] if self._detail and said else said)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Copy the network's tensors after the last step, by name."""
@@ -312,21 +227,17 @@ class Policy:
         try:
             frame, stamp = np.asarray(depth), float(stamp)
         except Exception:  # an object's own conversion may raise anything
-            self._detail = "the frame is no array, or its stamp no number"
             return Status.BAD_DEPTH
-        self._detail = self._check_frame(frame, stamp)
-        if self._detail:
+        usable = frame.dtype.kind == "f" or frame.dtype == np.uint16
+        if self.blind or frame.shape != self.image_shape or not usable or not np.isfinite(stamp):
             return Status.BAD_DEPTH
         metres = frame.astype(np.float32)
         if frame.dtype == np.uint16:
-            metres /= np.float32(1.0 / self.depth_scale)
+            metres /= np.float32(1000.0)
         valid = metres > 0.0  # and no NaN
         if 1.0 - valid.mean() > self._invalid:
             return Status.INVALID_DEPTH
         far = np.float32(self._d_max)
-        wrong = self._look_through(frame, np.where(valid, np.minimum(metres, far), far))
-        if wrong:
-            return wrong
         share = np.where(valid, np.minimum(metres, far), far) / far
         if not valid.all():
             # 1 / depth of a plane is linear in the image, so level ground is filled in exactly
@@ -338,35 +249,6 @@ class Policy:
             self._stamp = stamp
         return Status.OK
 
-    def _check_frame(self, frame: np.ndarray, stamp: float) -> str:
-        """Say why a frame cannot be read; empty if it can."""
-        if self.blind:
-            return "this policy takes no frames"
-        if frame.shape != self.image_shape:
-            rows, columns = self.image_shape
-            return f"a frame must be {rows} x {columns}, rows x columns, not {frame.shape}"
-        if frame.dtype.kind != "f" and frame.dtype != np.uint16:
-            return f"a frame must be float in m, or uint16 times depth_scale, not {frame.dtype}"
-        return "" if np.isfinite(stamp) else f"a frame's stamp must be a time in s, not {stamp}"
-
-    def _look_through(self, frame: np.ndarray, metres: np.ndarray) -> Status:
-        """Notice a camera that shows no ground ahead; `metres` end at d_max."""
-        if self._frame is not None and np.array_equal(frame, self._frame):
-            self._repeats += 1
-            moved = np.abs(self._q - self._frame_q).max()
-            if self._repeats >= FROZEN_FRAMES and moved > FROZEN_MOTION:
-                return Status.FROZEN_DEPTH
-        else:
-            self._repeats, self._frame, self._frame_q = 0, frame.copy(), self._q.copy()
-        if (metres < self._d_max).mean() < LEAST_SEEN:
-            return Status.SEES_NOTHING
-        rows = len(metres)
-        if np.median(metres[rows - rows // 6 :]) < NEAREST_GROUND:
-            return Status.SEES_TOO_NEAR
-        drop = float(metres[: rows // 3].mean() - metres[rows - rows // 3 :].mean())
-        self._way_up |= drop > UPSIDE_DOWN  # from then on what is near and high is in the way
-        return Status.CAMERA_TURNED if drop < -UPSIDE_DOWN and not self._way_up else Status.OK
-
     def _sense(self, inputs: Sequence[Any]) -> Status:
         """Check the measurements and write them into the observation if plausible."""
         count, joints = len(self.joints.names), self.joints
@@ -375,12 +257,8 @@ class Policy:
         if q is not None:
             possible = (q > joints.low - POSE_MARGIN) & (q < joints.high + POSE_MARGIN)
             if not possible.all():
-                worst = joints.names[int(np.argmin(possible))]
-                self._detail = f"q is beyond the range of {worst}: degrees, or another order?"
                 return Status.BAD_INPUT
             self._q[:] = q
-            if self._first is None:
-                self._first = self._q.copy()
         if (
             angular_velocity is None
             or gravity is None
@@ -388,27 +266,13 @@ class Policy:
             or q is None
             or qd is None
         ):
-            names = ("angular_velocity", "gravity", "command", "q", "qd")
-            wrong = [name for name, x in zip(names, vectors) if x is None]
-            self._detail = f"{', '.join(wrong)}: not as many finite numbers as there must be"
             return Status.BAD_INPUT
-        length = float(np.sqrt(gravity @ gravity))
-        if not GRAVITY_LENGTH[0] < length < GRAVITY_LENGTH[1]:
-            self._detail = f"gravity must be a unit vector, and its length is {length:.3g}"
+        if not GRAVITY_LENGTH[0] < float(np.sqrt(gravity @ gravity)) < GRAVITY_LENGTH[1]:
             return Status.BAD_INPUT
-        if gravity[2] > UPRIGHT * length:
-            return Status.GRAVITY_TURNED
-        if np.abs(angular_velocity).max() > MOST_TURNING:
-            return Status.GYRO_TOO_FAST
-        if np.abs(qd).max() > MOST_JOINT_SPEED:
-            return Status.JOINTS_TOO_FAST
         limited = np.clip(command, *self._command)
-        is_limited = (limited != command).any()
-        if self._stopped:
-            limited[:] = 0.0
         parts = (angular_velocity, gravity, limited, q - joints.default, qd, self._previous)
         np.concatenate(parts, out=self._obs)
-        return Status.COMMAND_LIMITED if is_limited else Status.OK
+        return Status.OK if (limited == command).all() else Status.COMMAND_LIMITED
 
     def _time(self, now: Any) -> Status:
         """Check the time of a step and the age of the current frame."""
@@ -416,25 +280,17 @@ class Policy:
         try:
             now = float(now)
         except (TypeError, ValueError, OverflowError):
-            now = math.nan
-        if not math.isfinite(now):
-            self._detail = "now must be a time in s"
+            return Status.BAD_INPUT
+        if not np.isfinite(now):
             return Status.BAD_INPUT
         self._before = now
         if before is not None and not 0.0 <= now - before <= LATE * self.period:
             status |= Status.LATE
         if self.blind:
             return status
-        if self._sighted is None or status & Status.LATE:  # the clock may have jumped
-            self._sighted = now
-        late = stamp is None or abs(now - stamp) > self._stale
-        self._sighted = self._sighted if late else now
-        self._stopped = now - self._sighted > STOP_AFTER
-        if self._stopped:
-            status |= Status.STOPPED
         if stamp is None:
             return status | Status.NO_DEPTH
-        return status | (Status.STALE_DEPTH if late else Status.OK)
+        return status | (Status.STALE_DEPTH if abs(now - stamp) > self._stale else Status.OK)
 
     def _act(self) -> Status:
         """Run the network and set the target if the action is finite."""
