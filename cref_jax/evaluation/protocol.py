@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 
-from cref_jax.config import Config
+from cref_jax.config import Config, Randomisation
 
 COMMANDS = (0.4, 0.8)  # m/s forward, Sec. III-A
 SECONDS = 20.0  # per episode on flat ground; assumed
@@ -42,7 +42,7 @@ def trial_config(c: Config) -> Config:
 
 def randomise(c: Config) -> Config:
     """Switch the randomisation on, with its default ranges, which are the same for all policies."""
-    return dataclasses.replace(c, randomisation=type(c.randomisation)())
+    return dataclasses.replace(c, randomisation=Randomisation())
 
 
 def robots_per_block() -> int:

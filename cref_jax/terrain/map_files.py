@@ -47,9 +47,8 @@ def read_values(path: Path) -> Values:
     Raises:
         ConfigError: there is no such file, or its values are no heights.
     """
-    values, no_data = (
-        (_read_array(path), None) if path.suffix.lower() == ".npy" else _read_picture(path)
-    )
+    is_array = path.suffix.lower() == ".npy"
+    values, no_data = (_read_array(path), None) if is_array else _read_picture(path)
     unknown = ~np.isfinite(values)
     if unknown.any():
         raise ConfigError(f"{path} has {unknown.sum()} heights that are not finite; fill them in")

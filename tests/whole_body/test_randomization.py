@@ -65,8 +65,7 @@ def test_late_targets_reach_the_motors_after_so_many_substeps(body):
     seen, zero, one = [], np.zeros(JOINTS), np.ones(JOINTS)
     for delay in (0, 1, 4):
         late = body.deviate(Deviation(delay=delay, offset=0.25))
-        state, count = _initial_state(late, STANDING), 0
-        at = []
+        state, at = _initial_state(late, STANDING), []
 
         def note(model, data, at=at):
             at.append(data.ctrl[body.driven[0]])
@@ -76,8 +75,7 @@ def test_late_targets_reach_the_motors_after_so_many_substeps(body):
             late.advance(state, (zero, one))
         finally:
             mujoco.set_mjcb_passive(None)
-        count = C.physics.substeps
-        seen.append(at[:count])
+        seen.append(at[: C.physics.substeps])
     # an encoder that reads 0.25 too much stops the motor 0.25 short of its target
     assert seen == [[0.75] * 4, [-0.25] + [0.75] * 3, [-0.25] * 4]
 
