@@ -15,6 +15,7 @@ import os
 import platform
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ def _first_origin(run: Path) -> dict[str, Any]:
 def first_option(run: Path, name: str) -> str | None:
     """Read an option from the command line that began a run, None if it was not given."""
     command = _first_origin(run).get("command", [])
-    for word, following in zip(command, [*command[1:], ""], strict=True):
+    for word, following in pairwise([*command, ""]):
         if word == f"--{name}":
             return following
         if word.startswith(f"--{name}="):

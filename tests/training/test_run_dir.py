@@ -1,4 +1,4 @@
-"""A run remembers the map that it began on."""
+"""A run remembers the map that it began on, and the command."""
 
 import json
 
@@ -30,3 +30,21 @@ def test_a_terrain_that_is_no_map_leaves_no_digest(tmp_path):
     assert "map" not in json.loads((tmp_path / "origin.jsonl").read_text())
     run_dir.check_map(tmp_path, "flat")
     run_dir.check_map(tmp_path / "nothing", "flat")
+
+
+@pytest.mark.parametrize(
+    ("command", "value"),
+    [
+        ([], None),
+        (["train", "--seed", "3"], None),
+        (["train", "--experiment", "robust", "--seed", "3"], "robust"),
+        (["train", "--experiment=robust"], "robust"),
+    ],
+)
+def test_an_option_is_read_from_the_command_that_began_a_run(tmp_path, command, value):
+    (tmp_path / "origin.jsonl").write_text(json.dumps({"command": command}) + "\n{}\n")
+    assert run_dir.first_option(tmp_path, "experiment") == value
+
+
+def test_a_run_without_a_first_command_gave_no_option(tmp_path):
+    assert run_dir.first_option(tmp_path, "experiment") is None
