@@ -1,6 +1,5 @@
 import ast
 import threading
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +8,7 @@ from tiny_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import config, deploy, depth
 from cref_jax.deploy import Status
-from cref_jax.policy import reference_vectors
+from cref_jax.policy import reference_vectors, runtime_file
 
 PERIOD = 0.02
 
@@ -288,4 +287,4 @@ def test_the_returned_target_is_the_callers(robot):
 
 
 def test_the_file_is_python_3_8():
-    ast.parse(Path(deploy.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))
+    ast.parse(runtime_file.join_files(), feature_version=(3, 8))

@@ -10,6 +10,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
+from cref_jax.policy.runtime_file import join_files
 from cref_jax.robot.registry import ROBOTS
 
 PACKAGE = Path(__file__).parents[1] / "cref_jax"
@@ -17,8 +18,8 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 
 
 FLOORS = [
-    {"errors", "geometry", "geoms", "deploy", "system"},
-    {"config", "cli"},
+    {"errors", "geometry", "geoms", "runtime", "system"},
+    {"config", "cli", "deploy"},
     {"robot", "terrain", "network", "ppo"},
     {"physics", "depth", "rendering", "pages"},
     {"env"},
@@ -37,7 +38,6 @@ WALLS = [  # a room, what it may not reach through any number of imports, and wh
         "it is an oracle of its own, and light",
     ),
     ("pages", ("env", "training", "ppo"), "a page is made of records"),
-    ("deploy", ("jax", "cref_jax", "flax", "mujoco"), "a robot has numpy alone"),
 ]
 
 
@@ -142,7 +142,7 @@ def test_only_startup_changes_the_environment_when_it_is_imported():
         text = "".join(ast.unparse(n) for n in top)
         if "os.environ.setdefault" in text or "os.environ[" in text:
             changes.append(name)
-    assert changes == ["deploy", "system.startup"]  # deploy stands alone on the robot
+    assert changes == ["runtime.threads", "system.startup"]  # the runtime stands alone on the robot
 
 
 def test_importing_the_package_leaves_jax_unused():
@@ -161,8 +161,7 @@ def test_the_package_itself_is_only_a_docstring():
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)
 def test_no_file_is_longer_than_400_lines(path):
-    most = 1050 if path.stem == "deploy" else 400  # it goes to the robot alone, so it is one file
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= most
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 400
 
 
 @pytest.mark.parametrize("path", FILES, ids=dotted)
@@ -174,7 +173,7 @@ def test_no_function_is_longer_than_50_lines(path):
 
 
 def test_the_deployed_policy_needs_numpy_and_nothing_else():
-    outside = {dotted.split(".")[0] for dotted in imports(tree("deploy"))}
+    outside = {dotted.split(".")[0] for dotted in imports(ast.parse(join_files()))}
     assert outside <= {"numpy", "__future__", *sys.stdlib_module_names}
 
 

@@ -3,7 +3,7 @@
 manifest.json      everything but the weights, with units, frames and origin
 weights.npz        float32 by flat names, uncompressed
 testvectors.npz    reference inputs and outputs of the trained network
-cref_runtime.py    deploy.py, which runs the policy with numpy alone
+cref_runtime.py    deploy.py and runtime/ as one file, which runs the policy with numpy alone
 """
 
 import hashlib
@@ -18,7 +18,7 @@ import numpy as np
 from cref_jax import deploy
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.policy import reader, reference_vectors
+from cref_jax.policy import reader, reference_vectors, runtime_file
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import pytree_digest
@@ -36,7 +36,7 @@ def write(policy: TrainedPolicy, world: World, out: Path) -> None:
     files = {
         "weights.npz": _to_npz({k: x.astype(np.float32) for k, x in weights.items()}),
         "testvectors.npz": _to_npz(reference_vectors.build_test_vectors(world, policy.train)),
-        "cref_runtime.py": Path(deploy.__file__).read_bytes(),
+        "cref_runtime.py": runtime_file.join_files(),
     }
     _write_files(out, build_manifest(policy, world.physics.robot), files)
 
@@ -51,7 +51,7 @@ def copy(policy: Path, out: Path) -> None:
     if not policy.is_dir():
         raise ConfigError(f"{policy} is not a directory")
     files = {name: (policy / name).read_bytes() for name in ("weights.npz", "testvectors.npz")}
-    files["cref_runtime.py"] = Path(deploy.__file__).read_bytes()
+    files["cref_runtime.py"] = runtime_file.join_files()
     _write_files(out, content, files)
 
 

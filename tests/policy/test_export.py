@@ -10,9 +10,10 @@ from tiny_policy import ROBOT, SMALL, J, policy, recorded
 
 from cref_jax import config, deploy, robot
 from cref_jax.errors import ConfigError
-from cref_jax.policy import reader, reference_vectors, sources, writer
+from cref_jax.policy import reader, reference_vectors, runtime_file, sources, writer
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.robot.x2_ultra import X2_ULTRA
+from cref_jax.runtime import network
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def test_a_directory_tests_itself_on_a_machine_with_nothing_but_numpy(directory)
 
 @pytest.mark.slow
 def test_a_runtime_that_says_something_else_fails_its_test(directory, monkeypatch):
-    monkeypatch.setattr(deploy._Fusion, "__call__", lambda self, x: np.copyto(self.out, x) or x)
+    monkeypatch.setattr(network._Fusion, "__call__", lambda self, x: np.copyto(self.out, x) or x)
     with pytest.raises(deploy.PolicyFormatError, match="differs from training"):
         deploy.self_test(directory)
 
@@ -133,7 +134,7 @@ def test_the_bundled_policy_is_whole_and_small_enough():
 def test_an_exported_policy_is_written_again_with_this_versions_runtime(tmp_path):
     writer.copy(sources.bundled_policy(), tmp_path / "policy")
     runtime = (tmp_path / "policy" / "cref_runtime.py").read_bytes()
-    assert runtime == Path(deploy.__file__).read_bytes()
+    assert runtime == runtime_file.join_files()
     deploy.self_test(tmp_path / "policy.zip", rounds=1)
     before, after = (
         reader.read_contents(p)[0] for p in (sources.bundled_policy(), tmp_path / "policy")

@@ -1,0 +1,1 @@
+"""The policy on the robot, with numpy alone; the export joins these files into cref_runtime.py."""
