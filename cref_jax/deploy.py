@@ -6,8 +6,10 @@
     target = policy.step(angular_velocity, gravity, command, q, qd, now)  # at 50 Hz
 
 `load` raises PolicyFormatError unless the files are exactly a policy. After loading, no call
-raises: faults of an input are reported in `policy.status`, the last target is held for some steps,
-and after that, until `reset`, the target is the measured pose, so that PD only damps.
+raises. Before the start the pose measured first is held until all inputs are right. After it, a
+sense that disagrees with the others is done without and the robot stands; an impossible input
+holds the last target for some steps, and then, until `reset`, the target is the measured pose, so
+that PD only damps. `policy.status` and `policy.why` say what is wrong.
 
 On a machine with only numpy: python cref_runtime.py --selftest policy/
 """

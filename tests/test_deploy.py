@@ -16,7 +16,7 @@ PERIOD = 0.02
 def runtime(variant="full", net=SMALL, **guards):
     manifest, arrays = contents(policy(variant, net))
     manifest["guards"].update(guards)
-    return deploy.Policy(manifest, arrays)
+    return deploy.Policy(manifest, arrays, careful=False)  # random inputs agree on nothing
 
 
 @pytest.fixture
@@ -209,16 +209,16 @@ def test_one_bad_input_is_bridged():
     assert not robot.status & (Status.HOLDING | Status.DAMPING)
 
 
-def test_without_a_last_target_a_bad_input_lets_the_robot_down(robot):
+def test_without_a_last_target_a_bad_input_is_no_start(robot):
     np.testing.assert_array_equal(robot.step(*still(qd=None)), ROBOT.nominal_pose)
-    assert robot.status & Status.DAMPING
+    assert robot.status & Status.NOT_STARTED
 
 
 def test_the_memory_of_an_answer_that_is_not_finite_is_never_used():
     manifest, arrays = contents(policy("full"))
     arrays = {k: np.array(x) for k, x in arrays.items()}
     arrays["action_head/layer_1/bias"][:] = arrays["action_head/layer_2/kernel"][:] = 3e38
-    robot = deploy.Policy(manifest, arrays)
+    robot = deploy.Policy(manifest, arrays, careful=False)
     assert np.isfinite(robot.step(*still())).all()
     assert robot.status & Status.BAD_ACTION
 

@@ -97,7 +97,7 @@ def test_a_bundled_policy_steps_and_forgets_when_it_is_reset(name: str):
     def walk() -> list[np.ndarray]:
         policy.reset()
         targets = []
-        for now in (0.0, 0.02, 0.04):
+        for now in 0.02 * np.arange(12):
             assert policy.on_depth(np.full(policy.image_shape, 1.0, np.float32), now) == 0
             gravity, ahead = np.array([0.0, 0.0, -1.0]), np.array([0.5, 0.0, 0.0])
             targets.append(policy.step(still, gravity, ahead, q, np.zeros_like(q), now))
@@ -106,7 +106,8 @@ def test_a_bundled_policy_steps_and_forgets_when_it_is_reset(name: str):
 
     first, again = walk(), walk()
     assert first[0].shape == (12,) and np.abs(np.array(first) - q).max() < 1.5  # rad
-    assert not np.array_equal(first[0], first[2])  # it remembers the steps before
+    np.testing.assert_array_equal(first[0], q)  # held for 0.2 s, while the inputs are checked
+    assert not np.array_equal(first[-1], first[-2])  # it remembers the steps before
     np.testing.assert_array_equal(first, again)
 
 

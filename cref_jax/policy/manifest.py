@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from cref_jax import config, deploy, ppo, robot
@@ -31,6 +32,7 @@ def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]
         },
         "joints": _joints(driven),
         "held_joints": _held_joints(c, driven),
+        "legs": _legs(c, driven),
         "action": _action(c),
         "observation": _observation(policy.train, driven),
         "command": _command(c),
@@ -69,6 +71,27 @@ def _held_joints(c: Config, driven: robot.Robot) -> list[dict[str, Any]]:
         {key: joint[key] for key in keys}
         for joint in _joints(whole)
         if joint["name"] not in driven.joint_names
+    ]
+
+
+def _legs(c: Config, driven: robot.Robot) -> list[dict[str, Any]]:
+    """List the joints from the base to each foot; axes in the base's frame, all joints at 0."""
+    model = robot.spec(robot.moving(c.robot), c.physics, 0, name=c.robot.name).compile()
+    upright = mujoco.MjData(model)
+    upright.qpos[:] = 0.0
+    upright.qpos[3] = 1.0
+    mujoco.mj_kinematics(model, upright)
+    legs = []
+    for foot in driven.ankles:
+        joints = []
+        while foot != driven.pelvis:
+            joints.insert(0, int(model.body_jntadr[foot]))
+            foot = int(model.body_parentid[foot])
+        legs.append(joints)
+    axis = lambda joint: [float(round(x, 9)) for x in upright.xaxis[joint]]
+    return [
+        {"joints": [{"name": model.joint(j).name, "axis": axis(j)} for j in joints]}
+        for joints in legs
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cref_jax.runtime.threads import ONE_THREAD
 
+import math
 import os
 import threading
 import warnings
@@ -12,31 +13,60 @@ from typing import Any
 
 import numpy as np
 
+from cref_jax.runtime.camera import Camera
 from cref_jax.runtime.files import contents, one_error
-from cref_jax.runtime.frames import fill_holes, nearest_around
 from cref_jax.runtime.joints import read_joints
+from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.network import VARIANTS, Actor, Encoder
-from cref_jax.runtime.status import FAULTS, Status
+from cref_jax.runtime.recorder import Recorder
+from cref_jax.runtime.senses import Senses
+from cref_jax.runtime.status import (
+    FAULTS,
+    SENSES_WRONG,
+    STOPPING,
+    TOO_FAST,
+    UNUSED_FRAME,
+    WHY,
+    Status,
+)
 from cref_jax.runtime.tables import PolicyFormatError, Table, Weights
 
 TERMS = ("angular_velocity", "gravity", "command", "joint_position", "joint_velocity", "action")
-GRAVITY_LENGTH = (0.8, 1.25)  # of a unit vector; rejects m/s^2
-POSE_MARGIN = 0.5  # rad beyond a joint's range; more means degrees, or another joint's angle
 LATE = 2.0  # control periods between two steps, at most
+STOP_AFTER = 0.3  # s with an old frame or an old command; half a step
+START_AFTER = 0.2  # s; a simulated robot whose pose is held falls after one second
+START_AGAIN = 1.0  # s, for which all must be right after something was wrong before the start
+FAR = 0.8  # rad from the default pose; from farther away, a start moves there first
+START_SPEED = 0.5  # rad/s, of the joint that moves most
+STILL = 0.5  # rad/s, of a robot that stands
 
 
-def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> Policy:
+def load(
+    path: str | os.PathLike[str],
+    joints: Sequence[str] | None = None,
+    depth_scale: float = 1e-3,
+    careful: bool = True,
+    start_after: float = START_AFTER,
+) -> Policy:
     """Load the policy in a directory, or in a .zip of one.
 
     Args:
         path: output of `python -m cref_jax.export`.
         joints: names of the robot's joints in its own order, which must equal the policy's.
+        depth_scale: m per unit of a camera's raw (uint16) values; a D435i's is 1e-3, others'
+            (D405, L515) 1e-4 or 2.5e-4.
+        careful: wait for a frame, start on level feet alone and move to the default pose slowly,
+            compare the senses with each other, and stop when they disagree.
+        start_after: s, for which all must be right before a careful start, while the pose measured
+            first is held; longer is better where the robot is held up.
 
     Raises:
         PolicyFormatError: a file is missing, damaged or of another format, or the joints differ.
     """
+    if not 1e-6 <= depth_scale <= 1.0:
+        raise PolicyFormatError(f"depth_scale must be 1e-6 to 1 m per unit, not {depth_scale}")
     with one_error(path):
-        policy = Policy(*contents(path))
+        policy = Policy(*contents(path), depth_scale, careful, start_after)
     if joints is not None and tuple(joints) != policy.joints.names:
         ours, theirs = ", ".join(policy.joints.names), ", ".join(map(str, joints))
         raise PolicyFormatError(f"{path}: its joints are {ours}, but the robot's are {theirs}")
@@ -48,64 +78,99 @@ def load(path: str | os.PathLike[str], joints: Sequence[str] | None = None) -> P
 class Policy:
     """A recurrent policy with its memory. Buffers are allocated once."""
 
-    def __init__(self, manifest: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    def __init__(
+        self,
+        manifest: dict[str, Any],
+        arrays: dict[str, np.ndarray],
+        depth_scale: float = 1e-3,
+        careful: bool = True,
+        start_after: float = START_AFTER,
+    ) -> None:
         """Check the manifest's numbers and the names and shapes of the arrays of weights.npz."""
         root, weights = Table(manifest, "manifest"), Weights(dict(arrays))
         net, guards, obs = root.table("network"), root.table("guards"), root.table("observation")
         self.joints = read_joints(root)
+        count = len(self.joints.names)
         self.period = 1.0 / root.table("rates").real("control_hz", 1.0, 1000.0)  # s
         self.blind = net.text("variant", VARIANTS) == "blind"
         self.status = Status.OK
-        size = 9 + 3 * len(self.joints.names)
         if [term.text("name") for term in obs.tables("terms")] != list(TERMS):
             raise PolicyFormatError(f"observation.terms must be {', '.join(TERMS)}")
+        size = 9 + 3 * count
         self._mean, self._std = obs.reals("mean", size), obs.reals("std", size, 1e-9)
         self._clip = obs.real("clip", 1e-3, 1e6)
         self._action_clip = root.table("action").real("clip", 1e-3, 1e6)
         command = root.table("command")
         self._command = command.reals("low", 3), command.reals("high", 3)
+        self._read_guards(guards, count)
+        self._camera: Camera | None = None
+        self.image_shape = (0, 0)  # rows, columns
+        if not self.blind:
+            self._camera = Camera(root.table("depth"), depth_scale, self._invalid)
+            self.image_shape = self._camera.shape
+            self._encoder = Encoder(net, weights, self.image_shape)
+        self._actor = Actor(net, weights, self.image_shape, size, count)
+        weights.finish()
+        self._careful, self._start_after = careful, start_after
+        legs = Legs(root, self.joints.names) if careful and root.has("legs") else None
+        self._senses = Senses(self.joints, legs, self.period, careful)
+        self.recorder = Recorder(self.period)
+        self._obs = np.zeros(size, np.float32)
+        self._target = np.zeros(count, np.float32)
+        self._lock = threading.Lock()
+        self.reset()
+
+    def _read_guards(self, guards: Table, count: int) -> None:
         self._hold_steps = guards.whole("hold_steps", 0, 1000)
         self._stale = guards.real("stale_s", 1e-3, 10.0)
         self._invalid = guards.real("max_invalid", 0.0, 1.0)
-        self._rate = guards.reals("rate_rad", len(self.joints.names), 0.0)
-        self._beyond = guards.reals("beyond_rad", len(self.joints.names), 0.0)
-        shape, self._d_max = (0, 0), 1.0
-        if not self.blind:
-            depth = root.table("depth")
-            shape = depth.whole("rows", 8, 1024), depth.whole("columns", 8, 1024)
-            self._d_max = depth.real("d_max_m", 0.01, 1000.0)
-            self._window = depth.whole("window", 1, 15) if depth.has("window") else 1
-            self._encoder = Encoder(net, weights, shape)
-        self.image_shape = shape  # rows, columns
-        self._actor = Actor(net, weights, shape, size, len(self.joints.names))
-        weights.finish()
-        self._obs = np.zeros(size, np.float32)
-        self._target = np.zeros(len(self.joints.names), np.float32)
-        self._q = self.joints.default.copy()
-        self._lock = threading.Lock()
-        self.reset()
+        self._rate = guards.reals("rate_rad", count, 0.0)
+        self._beyond = guards.reals("beyond_rad", count, 0.0)
 
     def reset(self) -> None:
         """Clear all memory: call before the first step, and to walk again after damping."""
         with self._lock:
             self._stamp: float | None = None
+            self._seen = Status.OK  # of the newest frame
+            if self._camera:
+                self._camera.reset()
             self._actor.reset()
+        self._senses.reset()
+        self.recorder.reset()
         self._previous = np.zeros(len(self.joints.names), np.float32)
         self._before: float | None = None  # time of the last step, s
-        self._aimed = False  # a target has been given
-        self._faults = self._hold_steps  # nothing to hold yet
+        self._good = 0  # steps in a row before the start in which all was right
+        self._wait = self._start_after  # s, for which all must be right
+        self._begun = False
+        self._aimed = False  # the network has given a target
+        self._ramp: list[np.ndarray] = []  # targets until the default pose
+        self._unseen = 0  # steps in a row without a frame that is new enough
+        self._told_to_stop = False
+        self._time_detail = ""
+        self._faults = 0  # steps in a row without a good input
         self._damping = False
         self.status = Status.OK
 
+    def stop(self) -> None:
+        """Stand from now on, whatever the command, until `reset`; see `on_both_feet`."""
+        self._told_to_stop = True
+
+    def on_both_feet(self) -> bool:
+        """Check whether the robot stands still with level feet, as after `stop`."""
+        senses = self._senses
+        return bool(senses.stands() and np.abs(senses.qd).max() < STILL)
+
     def on_depth(self, depth: Any, stamp: Any) -> Status:
-        """Encode a frame: z-depth [H, W] in metres, or uint16 in millimetres; row 0 is the top.
+        """Encode a frame: z-depth [H, W] in m, or uint16 times `depth_scale`; row 0 is the top.
 
         `stamp` is its time of exposure, s, on the clock of `step`. Depths beyond d_max, including
         infinity, are clipped to d_max, as misses were in training. Pixels that are 0 or NaN are
         holes, filled in from their surroundings.
         """
+        self.recorder.add_frame(depth, stamp)
         with np.errstate(all="ignore"):
-            return self._see(depth, stamp)
+            self._seen = self._see(depth, stamp)
+        return self._seen
 
     def step(
         self,
@@ -115,6 +180,7 @@ class Policy:
         q: Any,
         qd: Any,
         now: Any,
+        commanded: Any = None,
     ) -> np.ndarray:
         """Compute the joint targets for the next control period, rad [J]; sets `status`.
 
@@ -125,19 +191,29 @@ class Policy:
             q: joint angles, rad [J].
             qd: joint speeds, rad/s [J].
             now: the time, s.
+            commanded: when the command came, s on the same clock; without it, always just now.
         """
+        inputs = (angular_velocity, gravity, command, q, qd)
         with np.errstate(all="ignore"):
-            status = self._sense((angular_velocity, gravity, command, q, qd)) | self._time(now)
-            if not status & FAULTS:
-                status |= self._act()
-        self._faults = self._faults + 1 if status & FAULTS else 0
-        self._damping |= self._faults > self._hold_steps
-        if self._damping:
-            status |= Status.DAMPING
-        elif self._faults:
-            status |= Status.HOLDING
-        self.status = status
-        return (self._q if self._damping else self._target).copy()
+            status = self._time(now, commanded)
+            status |= self._senses.take(inputs, self._target if self._begun else None)
+            if not self._begun and not status & FAULTS:
+                status |= self._begin(status)
+            if self._told_to_stop or (status | self._seen) & STOPPING:
+                status |= Status.STOPPED
+            if self._begun and not status & FAULTS:
+                status |= self._act(bool(status & Status.STOPPED))
+        target = self._choose(status)
+        self.recorder.add_step((*inputs, now), target, int(self.status))
+        return target
+
+    @property
+    def why(self) -> str:
+        """What `status` says, in words."""
+        said = [words for flag, words in WHY.items() if flag & self.status]
+        frame = self._camera.detail if self._camera and self._seen else ""
+        details = (self._time_detail, self._senses.detail, frame)
+        return "; ".join([*said, *(detail for detail in details if detail)] if said else said)
 
     def tensors(self) -> dict[str, np.ndarray]:
         """Copy the network's tensors after the last step, by name."""
@@ -146,85 +222,84 @@ class Policy:
 
     def _see(self, depth: Any, stamp: Any) -> Status:
         """Check a frame and encode it if usable."""
-        try:
-            frame, stamp = np.asarray(depth), float(stamp)
-        except Exception:  # an object's own conversion may raise anything
+        if self._camera is None:
             return Status.BAD_DEPTH
-        usable = frame.dtype.kind == "f" or frame.dtype == np.uint16
-        if self.blind or frame.shape != self.image_shape or not usable or not np.isfinite(stamp):
-            return Status.BAD_DEPTH
-        metres = frame.astype(np.float32)
-        if frame.dtype == np.uint16:
-            metres /= np.float32(1000.0)
-        valid = metres > 0.0  # and no NaN
-        if 1.0 - valid.mean() > self._invalid:
-            return Status.INVALID_DEPTH
-        far = np.float32(self._d_max)
-        share = np.where(valid, np.minimum(metres, far), far) / far
-        if not valid.all():
-            # 1 / depth of a plane is linear in the image, so level ground is filled in exactly
-            share = np.where(valid, share, 1.0 / fill_holes(1.0 / share, valid))
-        image = (nearest_around(share, self._window) - 0.5).astype(np.float32)
+        senses = self._senses
+        gravity = senses.gravity if self._careful else None
+        status, image = self._camera.prepare(depth, stamp, senses.q, gravity)
+        if status & UNUSED_FRAME:
+            return status
         encoded = self._encoder(image.astype(np.float16).astype(np.float32))  # as in training
         with self._lock:
             self._actor.look(*encoded)
-            self._stamp = stamp
-        return Status.OK
+            self._stamp = float(stamp)
+        return status
 
-    def _sense(self, inputs: Sequence[Any]) -> Status:
-        """Check the measurements and write them into the observation if plausible."""
-        count, joints = len(self.joints.names), self.joints
-        vectors = [to_vector(x, size) for x, size in zip(inputs, (3, 3, 3, count, count))]
-        angular_velocity, gravity, command, q, qd = vectors
-        if q is not None:
-            possible = (q > joints.low - POSE_MARGIN) & (q < joints.high + POSE_MARGIN)
-            if not possible.all():
-                return Status.BAD_INPUT
-            self._q[:] = q
-        if (
-            angular_velocity is None
-            or gravity is None
-            or command is None
-            or q is None
-            or qd is None
-        ):
-            return Status.BAD_INPUT
-        if not GRAVITY_LENGTH[0] < float(np.sqrt(gravity @ gravity)) < GRAVITY_LENGTH[1]:
-            return Status.BAD_INPUT
-        limited = np.clip(command, *self._command)
-        parts = (angular_velocity, gravity, limited, q - joints.default, qd, self._previous)
-        np.concatenate(parts, out=self._obs)
-        return Status.OK if (limited == command).all() else Status.COMMAND_LIMITED
-
-    def _time(self, now: Any) -> Status:
-        """Check the time of a step and the age of the current frame."""
+    def _time(self, now: Any, commanded: Any) -> Status:
+        """Check the time of a step, and the age of the newest frame and of the command."""
         status, before, stamp = Status.OK, self._before, self._stamp
-        try:
-            now = float(now)
-        except (TypeError, ValueError, OverflowError):
-            return Status.BAD_INPUT
-        if not np.isfinite(now):
+        self._time_detail = ""
+        now, commanded = to_time(now), to_time(now if commanded is None else commanded)
+        if not math.isfinite(now) or not math.isfinite(commanded):
+            self._time_detail = "now and commanded must be times in s"
             return Status.BAD_INPUT
         self._before = now
         if before is not None and not 0.0 <= now - before <= LATE * self.period:
             status |= Status.LATE
-        if self.blind:
+        if abs(now - commanded) > STOP_AFTER:
+            status |= Status.STALE_COMMAND | Status.STOPPED
+        if self._camera is None:
             return status
+        old = stamp is None or abs(now - stamp) > self._stale + 1e-6  # rounding
+        self._unseen = self._unseen + 1 if old else 0  # in steps: the clock may be wrong
+        if self._unseen * self.period > STOP_AFTER:
+            status |= Status.STOPPED
         if stamp is None:
             return status | Status.NO_DEPTH
-        return status | (Status.STALE_DEPTH if abs(now - stamp) > self._stale else Status.OK)
+        return status | (Status.STALE_DEPTH if old else Status.OK)
 
-    def _act(self) -> Status:
+    def _begin(self, status: Status) -> Status:
+        """Begin when all has been right on level feet for long enough, or say why not."""
+        if not self._careful:
+            self._begun = True
+            return Status.OK
+        wrong = status & (SENSES_WRONG | TOO_FAST | Status.NO_DEPTH | Status.STALE_DEPTH)
+        level = self._good > 0 or self._senses.stands()
+        if not level or not self._senses.leans_as_legs_say():
+            wrong |= Status.NOT_ON_FEET
+        self._good = 0 if wrong else self._good + 1
+        if wrong & ~(Status.NO_DEPTH | Status.STALE_DEPTH):
+            self._wait = max(START_AGAIN, self._start_after)
+        self._begun = self._good > 0 and self._good * self.period > self._wait - 1e-6
+        first, default = self._senses.q.copy(), self.joints.default
+        way = float(np.abs(default - first).max())
+        if self._begun and way > FAR:
+            steps = int(way / (START_SPEED * self.period))
+            self._ramp = [first + (default - first) * (k / steps) for k in range(1, steps + 1)]
+        return wrong
+
+    def _act(self, standing: bool) -> Status:
         """Run the network and set the target if the action is finite."""
+        if self._ramp:
+            self._target[:] = self._ramp.pop(0)
+            return Status.STARTING
+        senses, joints = self._senses, self.joints
+        command = np.clip(senses.command, *self._command)
+        status = Status.COMMAND_LIMITED if (command != senses.command).any() else Status.OK
+        if standing:
+            command[:] = 0.0
+        q = senses.q - joints.default
+        parts = (senses.angular_velocity, senses.gravity, command, q, senses.qd, self._previous)
+        np.concatenate(parts, out=self._obs)
         self._obs -= self._mean
         self._obs /= self._std
         np.clip(self._obs, -self._clip, self._clip, out=self._obs)
         with self._lock:
             action = self._actor(self._obs)
         if not np.isfinite(action).all():
-            return Status.BAD_ACTION
+            return status | Status.BAD_ACTION
         np.clip(action, -self._action_clip, self._action_clip, out=self._previous)
-        return self._aim()
+        return status | self._aim()
 
     def _aim(self) -> Status:
         """Convert the action to the target, within the limits."""
@@ -241,14 +316,29 @@ class Policy:
         self._target[:], self._aimed = target, True
         return status
 
+    def _choose(self, status: Status) -> np.ndarray:
+        """Choose the target to return: the network's, the last one, or a pose; sets `status`."""
+        self._faults = self._faults + 1 if status & FAULTS else 0
+        self._damping |= self._begun and self._faults > self._hold_steps
+        if not self._begun:
+            if status & FAULTS:
+                self._good, self._wait = 0, max(START_AGAIN, self._start_after)
+            if not self._good and status & ~Status.NO_DEPTH:
+                status |= Status.NOT_STARTED
+        elif self._damping:
+            status |= Status.DAMPING
+        elif self._faults:
+            status |= Status.HOLDING
+        self.status = status | self._seen
+        if not self._begun:
+            first = self._senses.first
+            return (self.joints.default if first is None else first).copy()
+        return (self._senses.q if self._damping else self._target).copy()
 
-def to_vector(value: Any, size: int) -> np.ndarray | None:
-    """Convert to f32[size]; None unless the value is `size` finite numbers."""
+
+def to_time(value: Any) -> float:
+    """Convert to s; NaN unless the value is a number."""
     try:
-        array = np.asarray(value)
-    except Exception:  # an object's own conversion may raise anything
-        return None
-    if array.dtype.kind not in "fiu" or array.shape != (size,):
-        return None
-    array = array.astype(np.float32)
-    return array if np.isfinite(array).all() else None
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan

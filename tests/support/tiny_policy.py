@@ -60,11 +60,12 @@ def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.
     """Return random inputs that could be true: resets, and frames at no regular rate."""
     rng = np.random.default_rng(seed)
     draw = lambda *shape: rng.standard_normal(shape).astype(np.float32)
-    gravity = draw(count, 3) * np.float32(0.3) + np.float32([0, 0, -1])
+    gravity = np.clip(draw(count, 3), -1.5, 1.5) * np.float32(0.2) + np.float32([0, 0, -1])
     gravity /= np.linalg.norm(gravity, axis=1, keepdims=True)
     low, high = ROBOT.range_low, ROBOT.range_high
     q = low + (high - low) * rng.random((count, J), np.float32)
-    fresh = rng.random(count) < 0.4
+    reset, fresh = rng.random(count) < 0.02, rng.random(count) < 0.4
+    q[reset | (np.arange(count) == 0)] = ROBOT.nominal_pose  # a robot starts standing
     image = rng.uniform(-0.5, 0.5, (count, 48, 64)).astype(np.float16)
     which = np.maximum.accumulate(np.where(fresh, np.arange(count), 0))
     return reference_vectors.SensorLog(
@@ -73,7 +74,7 @@ def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.
         command=rng.uniform([0, -0.3, -1], [1, 0.3, 1], (count, 3)).astype(np.float32),
         q=q,
         qd=3 * draw(count, J),
-        reset=rng.random(count) < 0.02,
+        reset=reset,
         image=image[which] if sees else None,
         fresh=fresh if sees else np.zeros(count, bool),
     )
