@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from tiny_policy import ROBOT, SMALL, J, contents, metres, policy, recorded
 
-from cref_jax import config, deploy, depth
+from cref_jax import config, deploy, depth, terrain
 from cref_jax.deploy import Status
 from cref_jax.policy import reference_vectors, runtime_file
+from cref_jax.policy.sources import bundled_policy
+from cref_jax.runtime.camera import Camera
+from cref_jax.runtime.tables import Table
 
 PERIOD = 0.02
 
@@ -288,3 +291,78 @@ def test_the_returned_target_is_the_callers(robot):
 
 def test_the_file_is_python_3_8():
     ast.parse(runtime_file.join_files(), feature_version=(3, 8))
+
+
+def image_by_the_manifests_words(depth, words, max_invalid):
+    """Compute the network's image as someone would who has only read the manifest."""
+    assert words["formula"].startswith("float16(nearest / d_max_m - 0.5)")
+    known, far = depth > 0, words["d_max_m"]
+    assert 1 - known.mean() <= max_invalid
+    inverse = 1 / np.minimum(np.where(known, depth, 1.0), far)
+    rows = [r for r in range(48) if known[r].any()]
+    lines = {r: np.interp(range(64), np.flatnonzero(known[r]), inverse[r][known[r]]) for r in rows}
+    filled = np.array([
+        [np.interp(r, rows, [lines[k][c] for k in rows]) for c in range(64)] for r in range(48)
+    ])  # fmt: skip
+    ready = np.where(known, np.minimum(depth, far), 1 / filled)
+    reach = words["window"] // 2
+    nearest = np.array([
+        [ready[max(r - reach, 0) : r + reach + 1, max(c - reach, 0) : c + reach + 1].min()
+         for c in range(64)] for r in range(48)
+    ])  # fmt: skip
+    return np.float16(nearest / far - 0.5)
+
+
+@pytest.mark.parametrize("name", ["mixed", "robust"])
+def test_the_manifest_says_all_that_is_done_to_a_frame(name):
+    rng, manifest = np.random.default_rng(4), deploy.contents(bundled_policy(name))[0]
+    depth_image = rng.uniform(0.3, 4.0, (48, 64)).astype(np.float32)
+    depth_image[5], depth_image[20:24, 10:30], depth_image[30:40, :7] = 0.0, np.nan, -1.0
+    depth_image[rng.random((48, 64)) < 0.05] = np.inf
+    camera = Camera(Table(manifest["depth"], "depth"), 1e-3, 0.5)
+    said, image = camera.prepare(depth_image, 0.0, np.zeros(J), None)
+    assert said == Status.OK
+    words = image_by_the_manifests_words(depth_image, manifest["depth"], 0.5)
+    np.testing.assert_allclose(image.astype(np.float16), words, atol=5e-4)
+
+
+def test_a_larger_frame_of_the_same_view_gives_the_pixels_at_the_cells_middles(robot):
+    large = np.arange(480 * 848, dtype=np.float32).reshape(480, 848)
+    small = robot.preprocess(large, (58.0, 87.0))
+    assert small[0, 0] == large[5, 6]  # middles at 10 r + 5, and at 13.25 c + 6.625
+    assert small[47, 63] == large[475, 841]
+    np.testing.assert_array_equal(robot.preprocess(large[:, ::-1], (58.0, 87.0)), small[:, ::-1])
+
+
+def test_a_frame_of_another_view_shows_what_the_renderer_does(robot):
+    ground = terrain.from_heights(np.zeros((400, 400), np.float32), 0.02, (-4.0, -4.0))
+    axes = np.array([[0.0, -1.0, 0.0], [-0.7, 0.0, -0.7], [0.7, 0.0, -0.7]]).T / np.hypot(0.7, 0.7)
+    axes[:, 0] *= np.hypot(0.7, 0.7)
+    place, nothing = jnp.array([0.0, 0.0, 1.0]), jnp.zeros((0, 7))
+    see = lambda shape, view: np.asarray(
+        depth.render(
+            ground, place, jnp.asarray(axes), nothing, config.Camera(shape=shape, view=view)
+        )
+    )
+    true = see((48, 64), (58.0, 87.0))
+    wide = robot.preprocess(see((480, 640), (70.0, 100.0)), (70.0, 100.0))
+    np.testing.assert_allclose(wide, true, atol=0.03)
+    narrow = robot.preprocess(see((480, 640), (40.0, 60.0)), (40.0, 60.0))
+    seen = narrow > 0
+    assert 0.3 < seen.mean() < 0.5 and not seen[0].any() and not seen[:, 0].any()
+    np.testing.assert_allclose(narrow[seen], true[seen], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("frame", "view"),
+    [
+        (np.ones((48, 64, 1)), (58.0, 87.0)),
+        ("x", (58.0, 87.0)),
+        (np.ones((4, 4)), (58.0,)),
+        (np.ones((4, 4)), (0.0, 87.0)),
+        (np.ones((0, 4)), (58.0, 87.0)),
+    ],
+)
+def test_what_is_no_frame_or_no_view_is_not_resampled(robot, frame, view):
+    with pytest.raises(ValueError, match="must be"):
+        robot.preprocess(frame, view)

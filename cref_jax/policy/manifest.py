@@ -141,11 +141,16 @@ def _depth(c: Config) -> dict[str, Any]:
             "pitch_deg": c.camera.pitch,
         },
         "d_max_m": c.camera.d_max,
-        "invalid": "0 and NaN are filled in from around; infinity and beyond d_max read as d_max",
+        "range": "a depth beyond d_max_m, infinity as well, reads as d_max_m",
+        "invalid": "where depth is 0, negative or NaN, 1 / depth is interpolated linearly between"
+        " the nearest known pixels of its row, and is that of the outermost beyond them; a row"
+        " without known pixels likewise between the nearest rows with some; if more than"
+        " guards.max_invalid of the pixels are unknown, the frame is not used",
         "window": c.camera.window,
-        "resize": "the pixel nearest to each cell's middle, of an image with this view; a RealSense"
-        " D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees",
-        "formula": "float16(nearest / d_max - 0.5), nearest: of window x window pixels around",
+        "resize": "the pixel that the middle of each cell falls into, of an image with this view; a"
+        " RealSense D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees",
+        "formula": "float16(nearest / d_max_m - 0.5), nearest: the smallest depth of the window x"
+        " window pixels around, fewer at the border, after range and invalid",
     }
 
 

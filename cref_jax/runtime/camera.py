@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +30,8 @@ class Camera:
         self._d_max = depth.real("d_max_m", 0.01, 1000.0)
         self._window = depth.whole("window", 1, 15) if depth.has("window") else 1
         self._invalid = max_invalid
+        view = depth.table("view_deg")
+        self._view = view.real("vertical", 1.0, 175.0), view.real("horizontal", 1.0, 175.0)
         self._tilts = Agreement(1, TILT_FLOOR)
         self.reset()
 
@@ -42,6 +46,19 @@ class Camera:
         self._tilts.reset()
         self._tilted = np.zeros((2, 1))  # of late: ground in the frame, gravity
         self._before: tuple[float, float] | None = None
+
+    def resample(self, frame: np.ndarray, view: Sequence[float]) -> np.ndarray:
+        """Pick the pixels [H, W] of a larger frame that the policy's rays fall into; 0 outside it.
+
+        Args:
+            frame: [any height, any width], its optical axis that of the policy's camera.
+            view: vertical and horizontal angle that it shows, deg.
+        """
+        rows, columns = (
+            _find_pixels(*sizes) for sizes in zip(self.shape, self._view, frame.shape, view)
+        )
+        picked = frame[np.maximum(rows, 0)[:, None], np.maximum(columns, 0)]
+        return np.where((rows >= 0)[:, None] & (columns >= 0), picked, 0).astype(frame.dtype)
 
     def prepare(
         self, depth: Any, stamp: Any, q: np.ndarray, gravity: np.ndarray | None
@@ -127,6 +144,21 @@ class Camera:
         enough = self._tilts.count > FRAMES_TO_JUDGE
         self._mirrored |= enough and self._tilts.correlate_all() < MIRRORED
         return Status.CAMERA_MIRRORED if self._mirrored else Status.OK
+
+
+def _find_pixels(count: int, view: float, size: int, shown: float) -> np.ndarray:
+    """Find the pixels of a frame's side that `count` rays fall into; -1 outside.
+
+    Args:
+        count: rays, whose tangents are evenly spaced.
+        view: angle between the outermost borders of the rays, deg.
+        size: pixels.
+        shown: angle that they show, deg.
+    """
+    middles = (2.0 * np.arange(count) + 1.0) / count - 1.0  # in (-1, 1)
+    scale = math.tan(math.radians(0.5 * view)) / math.tan(math.radians(0.5 * shown))
+    pixels = np.floor(0.5 * (middles * scale + 1.0) * size + 1e-9).astype(int)
+    return np.where((pixels >= 0) & (pixels < size), pixels, -1)
 
 
 def fill_holes(values: np.ndarray, known: np.ndarray) -> np.ndarray:

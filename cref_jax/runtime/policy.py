@@ -160,6 +160,25 @@ class Policy:
         senses = self._senses
         return bool(senses.stands() and np.abs(senses.qd).max() < STILL)
 
+    def preprocess(self, frame: Any, view: Sequence[float]) -> np.ndarray:
+        """Convert a frame of any size and view to one for `on_depth`; 0 beyond its view.
+
+        Args:
+            frame: z-depth [height, width], m or raw units, whose optical axis is the policy's.
+            view: vertical and horizontal angle that it shows, deg.
+
+        Raises:
+            ValueError: the frame is no image, the view no view, or the policy is blind.
+        """
+        image = np.asarray(frame)
+        if self._camera is None:
+            raise ValueError("this policy takes no frames")
+        if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "fiu":
+            raise ValueError(f"a frame must be height x width numbers, not {image.shape}")
+        if len(view) != 2 or not all(1.0 <= angle <= 175.0 for angle in view):
+            raise ValueError(f"view must be two angles from 1 to 175 deg, not {view}")
+        return self._camera.resample(image, view)
+
     def on_depth(self, depth: Any, stamp: Any) -> Status:
         """Encode a frame: z-depth [H, W] in m, or uint16 times `depth_scale`; row 0 is the top.
 
