@@ -12,6 +12,7 @@ holds the last target for some steps, and then, until `reset`, the target is the
 that PD only damps. `policy.status` and `policy.why` say what is wrong.
 
 On a machine with only numpy: python cref_runtime.py --selftest policy/
+`policy.recorder.write("last.npz")` keeps the last 30 s for --replay and --check.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import cref_jax.runtime.threads  # noqa: F401
 import argparse
 import sys
 
+from cref_jax.runtime.check import check, replay
 from cref_jax.runtime.files import SCHEMA, contents, manifest_digest
 from cref_jax.runtime.joints import Joints
 from cref_jax.runtime.network import VARIANTS
@@ -39,26 +41,46 @@ __all__ = [
     "Policy",
     "PolicyFormatError",
     "Status",
+    "check",
     "contents",
     "load",
     "manifest_digest",
+    "replay",
     "report",
     "self_test",
 ]
 
 
 def main() -> None:
-    """Run the self-test from the command line; exit code 2 if it fails."""
-    parser = argparse.ArgumentParser(description="Test an exported policy on this machine.")
-    parser.add_argument("--selftest", metavar="DIRECTORY", required=True, help="or its .zip")
-    path = parser.parse_args().selftest
+    """Run the command line; exit code 2 if something cannot be read, 1 if something is odd."""
+    parser = argparse.ArgumentParser(description="An exported policy on this machine.")
+    add, both = parser.add_mutually_exclusive_group(required=True).add_argument, ("FILE", "POLICY")
+    add("--selftest", metavar="POLICY", help="compare with training; a directory or its .zip")
+    add("--replay", nargs=2, metavar=both, help="when which status began in a recording")
+    add("--check", nargs=2, metavar=both, help="what is odd of a robot that stood still for 5 s")
+    asked = parser.parse_args()
     try:
-        times = self_test(path)
+        sys.exit(_run(asked))
     except PolicyFormatError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    print(f"{path}: outputs match the training network to {TOLERANCE:g}")
-    print("\n".join(report(times)))
+
+
+def _run(asked: argparse.Namespace) -> int:
+    """Do what was asked; return the exit code."""
+    if asked.selftest:
+        times = self_test(asked.selftest)
+        print(f"{asked.selftest}: outputs match the training network to {TOLERANCE:g}")
+        print("\n".join(report(times)))
+        return 0
+    if asked.check:
+        odd = check(asked.check[1], asked.check[0])
+        print("\n".join(odd) if odd else "nothing is odd")
+        return 1 if odd else 0
+    lines, largest = replay(asked.replay[1], asked.replay[0])
+    print("\n".join(lines) if lines else "no status but OK")
+    print(f"largest difference of a target from the recorded one: {largest:.2g} rad")
+    return 0
 
 
 if __name__ == "__main__":

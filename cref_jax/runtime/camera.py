@@ -17,8 +17,8 @@ NEAREST_GROUND = 0.35  # m, median of the picture's lower sixth; walking shows 0
 UPSIDE_DOWN = 0.3  # m, by which the lower third is farther than the upper; upright it is nearer
 FROZEN_FRAMES = 3  # equal frames in a row, while joints move; a simulated camera has no noise
 TILT_FLOOR = 0.005  # of gravity to the side; less is no tilt
-MIRRORED = -0.35  # correlation of the ground's tilt in the frame and by gravity; walking: above 0
-FRAMES_TO_JUDGE = 30  # 1.5 s at 20 Hz
+MIRRORED = ((12, -0.8), (30, -0.35))  # frames; correlation of the ground's tilt in them and by
+# gravity. Walking with noise stays above -0.6 after 20 frames and above 0 after 80
 
 
 class Camera:
@@ -141,8 +141,9 @@ class Camera:
         self._tilted *= FADE
         self._tilted += np.array([[tilt - before[0]], [float(gravity[1]) - before[1]]])
         self._tilts.add(*self._tilted)
-        enough = self._tilts.count > FRAMES_TO_JUDGE
-        self._mirrored |= enough and self._tilts.correlate_all() < MIRRORED
+        agreement, frames = self._tilts.correlate_all(), self._tilts.count
+        for least, bound in MIRRORED:
+            self._mirrored |= frames > least and agreement < bound
         return Status.CAMERA_MIRRORED if self._mirrored else Status.OK
 
 

@@ -1,0 +1,152 @@
+"""What is odd in a recording: of a robot that stands still, or, replayed, of any."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from cref_jax.runtime.files import contents
+from cref_jax.runtime.legs import Legs
+from cref_jax.runtime.policy import Policy
+from cref_jax.runtime.recorder import INPUTS
+from cref_jax.runtime.status import WHY, Status
+from cref_jax.runtime.tables import PolicyFormatError, Table
+
+STILL_SECONDS = 5.0
+MOST_TILT = 5.0  # deg, of gravity, soles and camera
+MOST_BIAS = 0.05  # rad/s, of the gyro
+MOST_SPEED = 0.2  # rad/s, of joints, mean
+MOST_OFFSET = 0.2  # rad, from the default pose
+MOST_JITTER = 0.5  # periods, of 99 % of the steps
+
+
+def read_recording(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Read what `Policy.recorder.write` wrote.
+
+    Raises:
+        PolicyFormatError: it is no recording.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files}
+    except Exception as error:  # numpy raises many kinds on what is no .npz
+        raise PolicyFormatError(f"{path}: no recording: {error}") from None
+    missing = {*INPUTS, "frames", "stamps", "frame_step"} - set(kept)
+    if missing or not len(kept["now"]):
+        raise PolicyFormatError(f"{path}: no recording: no {min(missing, default='steps')}")
+    return kept
+
+
+def replay(
+    policy: str | os.PathLike[str], recording: str | os.PathLike[str]
+) -> tuple[list[str], float]:
+    """Give a recording to a policy again; return when which status began, and the largest change.
+
+    The change is that of a target, rad; it is 0 if nothing was lost before the recording.
+    """
+    kept, runtime = read_recording(recording), Policy(*contents(policy))
+    lines, before, largest = [], Status.OK, 0.0
+    for t in range(len(kept["now"])):
+        for k in np.flatnonzero(kept["frame_step"] == t):
+            runtime.on_depth(kept["frames"][k], kept["stamps"][k])
+        target = runtime.step(*(kept[name][t] for name in INPUTS))
+        if "target" in kept and kept["target"].shape[1:] == target.shape:
+            largest = max(largest, float(np.abs(target - kept["target"][t]).max()))
+        for flag, words in WHY.items():
+            if flag & runtime.status & ~before:
+                lines.append(f"{kept['now'][t] - kept['now'][0]:7.2f} s  {flag.name}: {words}")
+        before = runtime.status
+    return lines, largest
+
+
+def check(policy: str | os.PathLike[str], recording: str | os.PathLike[str]) -> list[str]:
+    """List what is odd in a recording of a robot that stood still in its default pose for 5 s."""
+    manifest, _ = contents(policy)
+    root, kept = Table(manifest, "manifest"), read_recording(recording)
+    runtime = Policy(*contents(policy))
+    seconds = float(kept["now"][-1] - kept["now"][0])
+    odd = [] if seconds >= STILL_SECONDS else [f"only {seconds:.1f} s, at least 5 are needed"]
+    finite = [bool(kept[name].size and np.isfinite(kept[name]).all()) for name in INPUTS]
+    if not all(finite):
+        return [*odd, f"not always numbers: {', '.join(np.array(INPUTS)[~np.array(finite)])}"]
+    odd += _check_times(kept, runtime.period)
+    odd += _check_senses(kept, runtime)
+    if root.has("legs"):
+        odd += _check_soles(kept, Legs(root, runtime.joints.names))
+    if not runtime.blind:
+        odd += _check_camera(kept, manifest["depth"], runtime)
+    return odd
+
+
+def _check_times(kept: dict[str, np.ndarray], period: float) -> Iterator[str]:
+    steps = np.diff(kept["now"])
+    if len(steps) and abs(np.median(steps) / period - 1.0) > 0.1:
+        yield f"a step every {np.median(steps):.4g} s, in place of {period:.4g}"
+    elif len(steps) and np.percentile(np.abs(steps - period), 99) > MOST_JITTER * period:
+        yield f"steps up to {1e3 * np.abs(steps - period).max():.0f} ms early or late"
+
+
+def _check_senses(kept: dict[str, np.ndarray], runtime: Policy) -> Iterator[str]:
+    gravity, gyro = kept["gravity"].mean(axis=0), kept["angular_velocity"].mean(axis=0)
+    tilt = np.degrees(np.arccos(np.clip(-gravity[2] / np.linalg.norm(gravity), -1.0, 1.0)))
+    if tilt > MOST_TILT:
+        yield f"gravity is {tilt:.0f} deg from (0, 0, -1): {np.round(gravity, 2)}"
+    if np.abs(gyro).max() > MOST_BIAS:
+        yield f"the gyro says {np.round(gyro, 3)} rad/s of a robot that stands"
+    for name in ("gravity", "angular_velocity"):
+        if (np.ptp(kept[name], axis=0) == 0.0).all():
+            yield f"{name} never changes: nothing measures it"
+    offset = kept["q"].mean(axis=0) - runtime.joints.default
+    for j in np.flatnonzero(np.abs(offset) > MOST_OFFSET):
+        yield f"{runtime.joints.names[j]} is {offset[j]:+.2f} rad from the default pose"
+    speed = kept["qd"].mean(axis=0)
+    for j in np.flatnonzero(np.abs(speed) > MOST_SPEED):
+        yield f"{runtime.joints.names[j]} turns by {speed[j]:+.2f} rad/s while it stands"
+
+
+def _check_soles(kept: dict[str, np.ndarray], legs: Legs) -> Iterator[str]:
+    down = legs.down(kept["q"].mean(axis=0).astype(np.float32))
+    gravity = kept["gravity"].mean(axis=0)
+    tilts = np.degrees(np.arccos(np.clip(down @ gravity / np.linalg.norm(gravity), -1.0, 1.0)))
+    if tilts.max() > MOST_TILT:
+        yield f"by gravity and joint angles the soles are {np.round(tilts)} deg from level"
+
+
+def _check_camera(
+    kept: dict[str, np.ndarray], depth: dict[str, Any], runtime: Policy
+) -> Iterator[str]:
+    frames, count = kept["frames"], len(kept["stamps"])
+    if not count or frames.shape[1:] != runtime.image_shape:
+        yield f"no frames of {runtime.image_shape}: {frames.shape[1:]}" if count else "no frames"
+        return
+    arrival = kept["now"][np.clip(kept["frame_step"], 0, len(kept["now"]) - 1)]
+    age = np.median(arrival - kept["stamps"].astype(float))
+    if not -0.02 <= age <= 0.1:
+        yield f"frames are {age:.3g} s old when they come: another clock?"
+    metres = frames[-1].astype(np.float64) * (1e-3 if frames.dtype == np.uint16 else 1.0)
+    known = (metres > 0.0) & (metres < depth["d_max_m"])
+    if known.mean() < 0.3:
+        yield f"{100 * known.mean():.0f} % of the pixels show anything nearer than d_max"
+        return
+    pitch, wanted = _fit_pitch(metres, known, depth), depth["mount"]["pitch_deg"]
+    pitch += np.degrees(np.arctan2(kept["gravity"][-1][0], -kept["gravity"][-1][2]))
+    if abs(pitch - wanted) > MOST_TILT:
+        yield (
+            f"the camera looks down by {pitch:.0f} deg, in place of {wanted:.0f}, if the ground is "
+            "level: another view, mount or order of rows?"
+        )
+
+
+def _fit_pitch(metres: np.ndarray, known: np.ndarray, depth: dict[str, Any]) -> float:
+    """Compute how far below the horizon a camera over level ground looks, deg.
+
+    1 / depth is (sin p + y cos p) / height, for a ray of slope y below the optical axis.
+    """
+    rows = len(metres)
+    half = np.tan(np.radians(0.5 * depth["view_deg"]["vertical"]))
+    slopes = np.broadcast_to((((2 * np.arange(rows) + 1) / rows - 1) * half)[:, None], metres.shape)
+    slope, level = np.polyfit(slopes[known], 1.0 / metres[known], 1)
+    return float(np.degrees(np.arctan2(level, slope)))
