@@ -125,7 +125,11 @@ def _subject(source: Path, options: Options) -> Subject:
     in_trials = options.suite in ("table", "robust", "cross")
     threads = max(parallel.cores() // jax.device_count(), 1) if in_trials else 0
     world = build_world(sources.read_config(source), options.engine, threads)
-    return Subject(source, sources.load(source, world), world)
+    policy = sources.load(source, world)
+    print(sources.describe(source, policy), flush=True)
+    if policy.config.terrain.name == "flat" and options.suite in ("table", "robust", "ood"):
+        print("on flat ground it learned to cross nothing: --suite walk measures what it learned")
+    return Subject(source, policy, world)
 
 
 def _trials_per_cell(options: Options) -> int:

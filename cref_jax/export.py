@@ -58,6 +58,7 @@ def _export(options: Options) -> None:
     world = build_world((learner_file if from_file else run_dir).read_config(run), "mujoco")
     print(f"exporting {run} ...", flush=True)
     policy = learner_file.read(run, world) if from_file else trained.load_policy(run, world)
+    print(sources.describe(run, policy), flush=True)
     writer.write(policy, world, options.out)
 
 

@@ -135,7 +135,10 @@ def play(options: Options) -> None:
     folder = source if source and sources.is_run(source) else Path()
     out = cli.prepare_output(options.out or folder / f"play{suffix}", suffix)
     world = _build_world(options, c)
-    train = sources.load(source, world).train if source and is_trained else None
+    policy = sources.load(source, world) if source and is_trained else None
+    if source and policy:
+        print(sources.describe(source, policy), flush=True)
+    train = policy.train if policy else None
     period = c.physics.control_period
     model = robot_scene.build(
         robot.moving(c.robot), c.physics, world.lanes.tile(0, 0), c.robot.name

@@ -81,6 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
             cli.prepare_output(options.out, ".json")
         path = sources.find_policy(options.policy or sources.bundled_policy())
         policy = reader.read(path)
+        print(sources.describe(path, policy), flush=True)
         physics = build_world(policy.config, "mujoco").physics
         record = (_run_table if options.table else _run_kind)(policy, path, physics, options)
         if options.out:

@@ -99,6 +99,8 @@ def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
     assert first["digest"] == second["digest"] and len(first["digest"]) == 64
     assert record["versions"]["mujoco"] and record["device"] and record["cores"]
     out = capsys.readouterr().out
+    assert "network full, trained on mixed for 86.0 M samples" in out
+    assert "--suite walk" not in out  # it crosses more than flat ground
     assert "95 % intervals of +-" in out and "stairs 23 cm (OOD)" in out
     assert "eval.html" in out and (tmp_path / "eval.html").stat().st_size > 10_000
 

@@ -60,6 +60,14 @@ def read_config(path: Path) -> Config:
     )
 
 
+def describe(path: Path, policy: TrainedPolicy) -> str:
+    """Say in one line which policy it is, and what it was trained on for how long."""
+    c = policy.config
+    sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
+    samples = f"{policy.samples / 1e6:.1f} M samples"
+    return f"{path}: {sees}, trained on {c.terrain.name} for {samples}"
+
+
 def load(path: Path, world: World) -> TrainedPolicy:
     """Load the policy of a run, a learner file or an export, for evaluation in JAX.
 
