@@ -30,6 +30,7 @@ CLEAR = 0.5  # correlation that tells an axis
 TURNED = 0.45  # correlation of the base's roll by gyro and by legs; walking stays above -0.3
 LEAST_NOISE = 0.1  # share of a signal
 LAG = 2  # steps after which noise has changed and motion has not
+MOUNT_JUDGED = 63.0  # weighted steps: 2 s; later nothing turns it, and a stumble looks like it
 FEET_STAND = 20  # steps after the start, before which no foot has been far from the ground
 DELAY = 2  # steps until a joint has begun to follow its target
 FROZEN_STEPS = 25  # with the same numbers
@@ -210,7 +211,9 @@ class CrossChecks:
             if (excess < -SURE_OF_ONE_AXIS * doubt).any():
                 roll, _, _, pitch = self._rolls.correlate()  # feet slip less sideways
                 found = self._blame(turns, float(roll if excess[1] < 0.0 else pitch))
-            elif along < -bound or (abs(across) > bound and along < 0.5 * abs(across)):
+            elif (standing or self._rolls.count < MOUNT_JUDGED) and (
+                along < -bound or (abs(across) > bound and along < 0.5 * abs(across))
+            ):
                 found = Status.IMU_TURNED
         if found:
             self._learn_axes(found, turns, legs)
