@@ -64,9 +64,9 @@ def replay(
 
 def check(policy: str | os.PathLike[str], recording: str | os.PathLike[str]) -> list[str]:
     """List what is odd in a recording of a robot that stood still in its default pose for 5 s."""
-    manifest, _ = contents(policy)
+    manifest, arrays = contents(policy)
     root, kept = Table(manifest, "manifest"), read_recording(recording)
-    runtime = Policy(*contents(policy))
+    runtime = Policy(manifest, arrays)
     seconds = float(kept["now"][-1] - kept["now"][0])
     odd = [] if seconds >= STILL_SECONDS else [f"only {seconds:.1f} s, at least 5 are needed"]
     finite = [bool(kept[name].size and np.isfinite(kept[name]).all()) for name in INPUTS]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -39,7 +40,7 @@ class Senses:
         self._checks.reset()
         self.first: np.ndarray | None = None  # q as measured first, rad
         self.detail = ""  # what is wrong with which input
-        self._tilts: list[np.ndarray] = []  # of the feet before the start
+        self._tilts: deque[np.ndarray] = deque(maxlen=2 * TILTS)  # of the feet, before the start
         self.angular_velocity = self.gravity = np.zeros(3, np.float32)
         self.command = np.zeros(3, np.float32)
         self.qd = np.zeros_like(self.q)
@@ -83,7 +84,7 @@ class Senses:
         self._tilts.append(self._tilt_feet())
         if len(self._tilts) < 2 * TILTS:
             return True
-        early, late = np.mean(self._tilts[:TILTS], axis=0), np.mean(self._tilts[-TILTS:], axis=0)
+        early, late = np.array(self._tilts).reshape(2, TILTS, -1, 3).mean(axis=1)
         held = self.first is None or np.abs(self.q - self.first).max() < MOST_SAG
         both_stand = held and np.abs(late - late[0]).max() < MOST_APART
         return bool(not both_stand or np.abs(late - early).max() < MOST_CHANGE)
