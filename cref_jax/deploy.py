@@ -12,7 +12,9 @@ holds the last target for some steps, and then, until `reset`, the target is the
 that PD only damps. `policy.status` and `policy.why` say what is wrong.
 
 On a machine with only numpy: python cref_runtime.py --selftest policy/
-`policy.recorder.write("last.npz")` keeps the last 30 s for --replay and --check.
+`policy.recorder.write("last.npz")` keeps the last 30 s for --replay and --check. Before the first
+walk, let the robot stand by its own controller in the default pose for five seconds, call `step`
+and `on_depth` without sending the targets, write, and look at what --check finds odd.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def read_recording(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             kept = {name: file[name] for name in file.files}
     except Exception as error:  # numpy raises many kinds on what is no .npz
         raise PolicyFormatError(f"{path}: no recording: {error}") from None
-    missing = {*INPUTS, "frames", "stamps", "frame_step"} - set(kept)
+    missing = {*INPUTS, "frames", "stamps", "frame_step", "depth_scale"} - set(kept)
     if missing or not len(kept["now"]):
         raise PolicyFormatError(f"{path}: no recording: no {min(missing, default='steps')}")
     return kept
@@ -47,7 +47,8 @@ def replay(
 
     The change is that of a target, rad; it is 0 if nothing was lost before the recording.
     """
-    kept, runtime = read_recording(recording), Policy(*contents(policy))
+    kept = read_recording(recording)
+    runtime = Policy(*contents(policy), float(kept["depth_scale"]))
     lines, before, largest = [], Status.OK, 0.0
     for t in range(len(kept["now"])):
         for k in np.flatnonzero(kept["frame_step"] == t):
@@ -126,7 +127,8 @@ def _check_camera(
     age = np.median(arrival - kept["stamps"].astype(float))
     if not -0.02 <= age <= 0.1:
         yield f"frames are {age:.3g} s old when they come: another clock?"
-    metres = frames[-1].astype(np.float64) * (1e-3 if frames.dtype == np.uint16 else 1.0)
+    scale = float(kept["depth_scale"]) if frames.dtype == np.uint16 else 1.0
+    metres = frames[-1] * scale
     known = (metres > 0.0) & (metres < depth["d_max_m"])
     if known.mean() < 0.3:
         yield f"{100 * known.mean():.0f} % of the pixels show anything nearer than d_max"

@@ -39,17 +39,30 @@ class Legs:
         """Compute where the soles point in the base's frame, a unit vector of each [legs, 3]."""
         return -self._turn_down(q)[1][:, :, 2]
 
-    def turn(self, q: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        """Compute how far the base turned about its own axes if a foot stood still, rad [3].
+    def turning_about(self, axis: int) -> list[list[int]]:
+        """List the joints of each leg, from the hip down, that turn about x, y or z (0, 1, 2)."""
+        about = np.abs(self._axes).argmax(axis=-1) == axis
+        return [columns[those].tolist() for columns, those in zip(self._columns, about)]
+
+    def signs(self, count: int) -> np.ndarray:
+        """Compute for each of `count` joints the sign of its axis; 1 for those of no leg."""
+        signs = np.ones(count, np.float32)
+        signs[self._columns] = np.sign(self._axes.sum(axis=-1))
+        return signs
+
+    def turns(self, q: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """Compute how far the base turned over each foot, if that stood still, rad [legs, 3].
 
         Args:
             q: joint angles, rad [J].
             moved: their changes, rad [J].
-
-        Of the feet, the one counts by whose leg the base turned least.
         """
         axes, _ = self._turn_down(q)
-        turns = -np.einsum("lja,lj->la", axes, moved[self._columns])
+        return -np.einsum("lja,lj->la", axes, moved[self._columns])
+
+    def turn(self, q: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """Compute how far the base turned by the leg of which this is least, rad [3]."""
+        turns = self.turns(q, moved)
         return turns[int(np.argmin((turns * turns).sum(axis=1)))]
 
     def _turn_down(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from cref_jax.runtime.files import contents, one_error
 from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.network import VARIANTS, Actor, Encoder
+from cref_jax.runtime.nudge import Nudge
 from cref_jax.runtime.recorder import Recorder
 from cref_jax.runtime.senses import Senses
 from cref_jax.runtime.status import (
@@ -55,8 +56,9 @@ def load(
         joints: names of the robot's joints in its own order, which must equal the policy's.
         depth_scale: m per unit of a camera's raw (uint16) values; a D435i's is 1e-3, others'
             (D405, L515) 1e-4 or 2.5e-4.
-        careful: wait for a frame, start on level feet alone and move to the default pose slowly,
-            compare the senses with each other, and stop when they disagree.
+        careful: wait for a frame, start on level feet alone, swing the hips a little before that
+            and move to the default pose slowly; compare the senses with each other, and stop when
+            they disagree.
         start_after: s, for which all must be right before a careful start, while the pose measured
             first is held; longer is better where the robot is held up.
 
@@ -114,7 +116,8 @@ class Policy:
         self._careful, self._start_after = careful, start_after
         legs = Legs(root, self.joints.names) if careful and root.has("legs") else None
         self._senses = Senses(self.joints, legs, self.period, careful)
-        self.recorder = Recorder(self.period)
+        self._nudge = Nudge(legs, self.joints, self.period) if legs else None
+        self.recorder = Recorder(self.period, depth_scale)
         self._obs = np.zeros(size, np.float32)
         self._target = np.zeros(count, np.float32)
         self._lock = threading.Lock()
@@ -136,6 +139,9 @@ class Policy:
                 self._camera.reset()
             self._actor.reset()
         self._senses.reset()
+        if self._nudge:
+            self._nudge.reset()
+        self._refused = Status.OK  # what the nudge has shown to be wrong
         self.recorder.reset()
         self._previous = np.zeros(len(self.joints.names), np.float32)
         self._before: float | None = None  # time of the last step, s
@@ -212,6 +218,7 @@ class Policy:
             now: the time, s.
             commanded: when the command came, s on the same clock; without it, always just now.
         """
+        commanded = now if commanded is None else commanded
         inputs = (angular_velocity, gravity, command, q, qd)
         with np.errstate(all="ignore"):
             status = self._time(now, commanded)
@@ -223,7 +230,7 @@ class Policy:
             if self._begun and not status & FAULTS:
                 status |= self._act(bool(status & Status.STOPPED))
         target = self._choose(status)
-        self.recorder.add_step((*inputs, now), target, int(self.status))
+        self.recorder.add_step((*inputs, now, commanded), target, int(self.status))
         return target
 
     @property
@@ -231,7 +238,8 @@ class Policy:
         """What `status` says, in words."""
         said = [words for flag, words in WHY.items() if flag & self.status]
         frame = self._camera.detail if self._camera and self._seen else ""
-        details = (self._time_detail, self._senses.detail, frame)
+        nudge = self._nudge.detail if self._nudge else ""
+        details = (self._time_detail, self._senses.detail, nudge, frame)
         return "; ".join([*said, *(detail for detail in details if detail)] if said else said)
 
     def tensors(self) -> dict[str, np.ndarray]:
@@ -258,7 +266,7 @@ class Policy:
         """Check the time of a step, and the age of the newest frame and of the command."""
         status, before, stamp = Status.OK, self._before, self._stamp
         self._time_detail = ""
-        now, commanded = to_time(now), to_time(now if commanded is None else commanded)
+        now, commanded = to_time(now), to_time(commanded)
         if not math.isfinite(now) or not math.isfinite(commanded):
             self._time_detail = "now and commanded must be times in s"
             return Status.BAD_INPUT
@@ -283,19 +291,32 @@ class Policy:
             self._begun = True
             return Status.OK
         wrong = status & (SENSES_WRONG | TOO_FAST | Status.NO_DEPTH | Status.STALE_DEPTH)
+        wrong |= self._refused
         level = self._good > 0 or self._senses.stands()
         if not level or not self._senses.leans_as_legs_say():
             wrong |= Status.NOT_ON_FEET
         self._good = 0 if wrong else self._good + 1
         if wrong & ~(Status.NO_DEPTH | Status.STALE_DEPTH):
             self._wait = max(START_AGAIN, self._start_after)
-        self._begun = self._good > 0 and self._good * self.period > self._wait - 1e-6
+        ready = self._good > 0 and self._good * self.period > self._wait - 1e-6
+        if refused := self._watch_nudge(ready):
+            self._refused, self._good, ready = refused, 0, False
+        self._begun = ready
         first, default = self._senses.q.copy(), self.joints.default
         way = float(np.abs(default - first).max())
         if self._begun and way > FAR:
             steps = int(way / (START_SPEED * self.period))
             self._ramp = [first + (default - first) * (k / steps) for k in range(1, steps + 1)]
-        return wrong
+        return wrong | self._refused
+
+    def _watch_nudge(self, ready: bool) -> Status:
+        """Go on with the swing of the hips, or begin it anew; judge it when all else is ready."""
+        if self._nudge is None or not self._good:
+            return Status.OK
+        if self._good == 1:
+            self._nudge.reset()
+        self._nudge.add(self._senses.q, self._senses.angular_velocity)
+        return self._nudge.judge() if ready else Status.OK
 
     def _act(self, standing: bool) -> Status:
         """Run the network and set the target if the action is finite."""
@@ -351,7 +372,8 @@ class Policy:
         self.status = status | self._seen
         if not self._begun:
             first = self._senses.first
-            return (self.joints.default if first is None else first).copy()
+            held = self.joints.default if first is None else first
+            return held + self._nudge.offset() if self._nudge and self._good else held.copy()
         return (self._senses.q if self._damping else self._target).copy()
 
 

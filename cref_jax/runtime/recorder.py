@@ -11,13 +11,14 @@ import numpy as np
 
 SECONDS = 30.0
 FRAME_RATE = 30.0  # 1/s, at most
-INPUTS = ("angular_velocity", "gravity", "command", "q", "qd", "now")
+INPUTS = ("angular_velocity", "gravity", "command", "q", "qd", "now", "commanded")
 
 
 class Recorder:
     """A ring of what a policy was given and what it answered, since its reset."""
 
-    def __init__(self, period: float) -> None:
+    def __init__(self, period: float, depth_scale: float) -> None:
+        self._depth_scale = depth_scale
         self._steps: deque[tuple[list[Any], np.ndarray, int]] = deque(maxlen=int(SECONDS / period))
         self._frames: deque[tuple[Any, Any, int]] = deque(maxlen=int(SECONDS * FRAME_RATE))
         self.reset()
@@ -47,6 +48,7 @@ class Recorder:
         arrays["frames"] = _stack([frame for frame, _, _ in frames])
         arrays["stamps"] = _stack([stamp for _, stamp, _ in frames])
         arrays["frame_step"] = np.array([step - first for _, _, step in frames], np.int64)
+        arrays["depth_scale"] = np.array(self._depth_scale)
         arrays["lost"] = np.array(first, np.int64)
         with open(path, "wb") as file:
             np.savez(file, **arrays)

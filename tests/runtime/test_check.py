@@ -14,9 +14,9 @@ from cref_jax.policy.sources import bundled_policy
 POLICY = bundled_policy("robust")
 
 
-def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value):
+def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value, **options):
     """Record a robot that stands before level ground; `change` makes one input wrong."""
-    policy, rng = deploy.load(POLICY), np.random.default_rng(0)
+    policy, rng = deploy.load(POLICY, **options), np.random.default_rng(0)
     q = policy.joints.default
     for k in range(round(50 * seconds)):
         if k % 5 == 0:
@@ -29,6 +29,7 @@ def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value):
             "q": q + rng.normal(0.0, 1e-3, len(q)),
             "qd": rng.normal(0.0, 0.02, len(q)),
             "now": 0.02 * k,
+            "commanded": 0.02 * k,
         }
         policy.step(*(change(name, value, k) for name, value in inputs.items()))
     policy.recorder.write(tmp_path / "standing.npz")
@@ -62,6 +63,19 @@ def test_of_a_robot_that_stands_nothing_is_odd(tmp_path):
 def test_what_is_odd_is_named(tmp_path, which, by, words):
     odd = deploy.check(POLICY, standing(tmp_path, change=one(which, by)))
     assert any(words in line for line in odd), odd
+
+
+def test_a_recording_knows_the_unit_of_raw_frames(tmp_path):
+    raw = one("frame", lambda f: np.round(f * 1e4).astype(np.uint16))
+    kept = standing(tmp_path, change=raw, depth_scale=1e-4)
+    assert deploy.check(POLICY, kept) == []
+    lines, largest = deploy.replay(POLICY, kept)
+    assert largest == 0.0 and not any("SEES" in line for line in lines)
+
+
+def test_a_recording_knows_when_commands_came(tmp_path):
+    lines, largest = deploy.replay(POLICY, standing(tmp_path, change=one("commanded", lambda t: 0)))
+    assert any("0.32 s  STALE_COMMAND" in line for line in lines) and largest == 0.0
 
 
 def test_a_short_recording_is_not_enough(tmp_path):
