@@ -15,10 +15,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
-import tyro
 from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
@@ -27,7 +26,9 @@ from cref_jax import cli, config
 from cref_jax.benchmarks import brax_peer, roofline, stages, warp_raycast
 from cref_jax.benchmarks.roofline import Rates
 from cref_jax.config import Config, limits, presets
+from cref_jax.config.ranges import Within
 from cref_jax.env.world import World, build_world
+from cref_jax.errors import ConfigError
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.system import jax_setup, parallel
@@ -44,9 +45,9 @@ class Options(cli.DebugOption):
 
     terrain: str = "mixed"
     """terrain name"""
-    num_envs: tuple[int, ...] = (64, 256)
+    num_envs: Annotated[tuple[int, ...], Within(1, 1_000_000)] = (64, 256)
     """numbers of parallel robots; every stage is measured with each"""
-    repeats: int = 5
+    repeats: Annotated[int, Within(1, 1000)] = 5
     """repetitions; the fastest is reported"""
     engines: tuple[EngineName, ...] = ()
     """engines to compare with the default one, at the last number of robots; mjx on a CPU gives
@@ -69,11 +70,19 @@ class StageTime(NamedTuple):
     share: float | None = None  # of the machine's bound; None if that is unknown
 
 
-def main() -> None:
-    """Run the command line."""
-    options = tyro.cli(Options, prog="python -m cref_jax.bench")
-    with cli.one_line_errors(options.debug):
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "bench")
         jax_setup.prepare(options.engines)
+        if not options.num_envs:
+            raise ConfigError("--num-envs takes at least one number of robots")
+        if options.out:
+            cli.prepare_output(options.out, ".json")
+        for count in options.num_envs:
+            _stage_config(options, count)  # what cannot run is said before anything is measured
+        robots = " and ".join(map(str, options.num_envs))
+        print(f"{options.terrain}, {robots} robots, on {_machine_name()}", flush=True)
         rates = roofline.measure_rates()
         rows = measure_stages(options, rates)
         speeds = compare_depth(options) if options.depth else []

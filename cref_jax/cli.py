@@ -1,13 +1,20 @@
-"""Shared by the commands: one-line errors and checks of output files."""
+"""Shared by the commands: their options, one-line errors and checks of output files."""
 
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
+import tyro
+
+from cref_jax.config.ranges import check_ranges, declared_ranges
 from cref_jax.errors import CheckpointError, ConfigError, TrainingError
+
+R = TypeVar("R")
+READER_GONE = 141  # exit code of a program that SIGPIPE ends
 
 
 @dataclass(frozen=True)
@@ -28,19 +35,37 @@ class PolicyOptions(DebugOption):
     """an exported policy instead of a run"""
 
 
-@contextlib.contextmanager
-def one_line_errors(debug: bool = False, is_program: bool = True) -> Iterator[None]:
-    """Print errors a user can fix as one line on stderr and exit with 2; `debug` re-raises them.
+def parse(options: type[R], arguments: Sequence[str] | None, command: str) -> R:
+    """Parse the options of a command, and check their numbers.
 
-    Failed training exits with 1, Ctrl-C with 130, unless a notebook or a script has called the
-    command, which goes on.
+    Raises:
+        ConfigError: a number is out of the range that its field is annotated with.
     """
+    parsed = tyro.cli(options, args=arguments, prog=f"python -m cref_jax.{command}")
+    check_ranges(parsed, declared_ranges(options))
+    return parsed
+
+
+@contextlib.contextmanager
+def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
+    """Print errors a user can fix as one line on stderr and exit with 2; --debug re-raises them.
+
+    Failed training exits with 1, Ctrl-C with 130, output that nobody reads with 141. A notebook or
+    a script that has called the command with `arguments` goes on after Ctrl-C.
+    """
+    is_program = arguments is None
     try:
         yield
-    except (ConfigError, CheckpointError, TrainingError) as error:
-        if debug:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        if not is_program:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # flushed once more at exit
+        sys.exit(READER_GONE)
+    except (ConfigError, CheckpointError, TrainingError, OSError) as error:
+        if "--debug" in (sys.argv if arguments is None else arguments):
+            raise
+        print(f"error: {_one_line(error)}", file=sys.stderr)
         sys.exit(1 if isinstance(error, TrainingError) else 2)
     except KeyboardInterrupt:
         if not is_program:
@@ -48,6 +73,13 @@ def one_line_errors(debug: bool = False, is_program: bool = True) -> Iterator[No
         print("interrupted", file=sys.stderr)
         sys.stdout.flush()
         os._exit(130)  # at once: a running XLA program may still call into this interpreter
+
+
+def _one_line(error: Exception) -> str:
+    """Return what an error says; what the system refuses comes with the file that it is about."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
 
 
 def prepare_output(out: Path, suffix: str, option: str = "--out") -> Path:
@@ -58,10 +90,22 @@ def prepare_output(out: Path, suffix: str, option: str = "--out") -> Path:
     """
     if out.suffix != suffix:
         raise ConfigError(f"{option} must end in {suffix}: {out}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot make the folder {out.parent}: {error.strerror}") from None
+    prepare_folder(out.parent)
     if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
         raise ConfigError(f"cannot write {out}")
     return out
+
+
+def prepare_folder(folder: Path) -> Path:
+    """Create a folder for output, check that files can be written there, and return it.
+
+    Raises:
+        ConfigError: it cannot be made or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the folder {folder}: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ConfigError(f"cannot write in the folder {folder}")
+    return folder

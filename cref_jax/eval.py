@@ -3,6 +3,7 @@
 import cref_jax.system.startup  # noqa: F401
 
 import contextlib
+import dataclasses
 import json
 import tempfile
 import time
@@ -17,6 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from cref_jax import cli
+from cref_jax.config import limits
+from cref_jax.config.ranges import Within
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import (
@@ -49,22 +52,23 @@ class Options(cli.DebugOption):
     such as seeds of one training, the table pools their trials"""
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
-    suite: Suite = "table"
-    """table: the twelve cells of Table II and the failures of Table III; robust: the same with
+    suite: Suite | None = None
+    """(default: walk for a policy of flat ground, table for all others) table: the twelve cells of
+    Table II and the failures of Table III; robust: the same with
     masses, friction, motors, delays, sensors, pushes and camera mount randomised, and with each of
     these alone; ood: twenty scenes outside the training distribution, in MuJoCo C by the numpy
     runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
     to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping"""
     kind: Annotated[str, tyro.conf.arg(help=f"kind of lane to cross: {', '.join(KINDS)}")] = "gap"
-    size: float = 0.3
+    size: Annotated[float, Within(0, 100)] = 0.3
     """size of the obstacles, m; for a slope its gradient"""
-    num_envs: int | None = None
+    num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
     """trials per cell, or episodes (default: 100 on a CPU, 2000 on an accelerator; 10 per scene)"""
-    stress: int = 2
+    stress: Annotated[int, Within(0, 1000)] = 2
     """trials per scene under each condition: lost, late and partly blind frames, friction"""
     film: str | None = None
     """film one trial in this scene instead of evaluating in all: SCENE.mp4"""
-    seed: int = 0
+    seed: Annotated[int, limits.SEED] = 0
     """seed of initial states and commands"""
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx and warp on the device"""
@@ -82,12 +86,15 @@ class Subject(NamedTuple):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.eval")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "eval")
         jax_setup.prepare([options.engine])
-        subjects = [_subject(path, options) for path in _resolve_sources(options)]
-        source = subjects[0].source
-        out = options.out or (source if sources.is_run(source) else Path())
+        paths = _resolve_sources(options)
+        trained_on = [sources.read_config(path).terrain.name for path in paths]
+        options = dataclasses.replace(options, suite=options.suite or _suite_for(trained_on))
+        out = options.out or (paths[0] if sources.is_run(paths[0]) else Path())
+        cli.prepare_output(out / "eval.json", ".json")
+        subjects = [_subject(path, options) for path in paths]
         if options.film:
             _film(subjects[0], options, out / f"{options.film}.mp4")
             return
@@ -96,7 +103,7 @@ def main(arguments: list[str] | None = None) -> None:
             "table": _table, "robust": _robust, "ood": _ood, "cross": _cross, "walk": _walk,
             "commands": _commands,
         }  # fmt: skip
-        found = suites[options.suite](subjects, options)
+        found = suites[options.suite or "table"](subjects, options)
         record = {"suite": options.suite, "seed": options.seed, **_provenance(subjects)}
         record |= {"seconds": round(time.monotonic() - started, 1), **found}
         _write(out, record)
@@ -108,16 +115,19 @@ def _resolve_sources(options: Options) -> list[Path]:
     Raises:
         ConfigError: an option that cannot be used.
     """
-    if options.num_envs is not None and options.num_envs < 1:
-        raise ConfigError(f"--num-envs must be at least 1, not {options.num_envs}")
     if options.run and options.policy:
         raise ConfigError("give --run or --policy, not both")
     if options.film and options.suite != "ood":
         raise ConfigError("--film takes a scene of --suite ood; a lane is filmed by cref_jax.play")
     given = [*options.run, *map(sources.find_policy, options.policy)]
-    if len(given) > 1 and options.suite != "table":
+    if len(given) > 1 and options.suite not in (None, "table"):
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
     return given or [sources.resolve_policy(None, None)]
+
+
+def _suite_for(terrains: list[str]) -> Suite:
+    """Choose the suite that measures what was learned on these terrains."""
+    return "walk" if terrains == ["flat"] else "table"
 
 
 def _subject(source: Path, options: Options) -> Subject:

@@ -5,10 +5,9 @@ import cref_jax.system.startup  # noqa: F401
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from cref_jax import cli, deploy
 from cref_jax.env.world import build_world
+from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, sources, trained, writer
 from cref_jax.system import jax_setup
 from cref_jax.training import run_dir
@@ -31,15 +30,19 @@ class Options(cli.PolicyOptions):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.export")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "export")
         jax_setup.prepare()
+        if not options.out.name:
+            raise ConfigError(f"--out must be a folder with a name, not {options.out}")
         if options.learner:
             _write_learner(
                 options.run or run_dir.newest(),
                 cli.prepare_output(options.learner, ".npz", "--learner"),
             )
             return
+        cli.prepare_output(options.out.with_name(options.out.name + ".zip"), ".zip")
+        cli.prepare_folder(options.out)
         if options.policy:
             writer.copy(sources.resolve_policy(options.run, options.policy), options.out)
         else:

@@ -13,12 +13,11 @@ import collections
 import dataclasses
 import os
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jax.experimental import topologies
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -29,6 +28,7 @@ from rich.table import Table
 from cref_jax import cli, depth, robot
 from cref_jax.benchmarks import hlo
 from cref_jax.config import Config, limits, presets
+from cref_jax.config.ranges import Within
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Backend, Body
@@ -98,7 +98,7 @@ class Options(cli.DebugOption):
     """GPU to compile for"""
     terrain: str = "mixed"
     """terrain name"""
-    num_envs: int | None = None
+    num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
     """parallel robots (default: as in `make train` on a GPU)"""
 
 
@@ -111,12 +111,12 @@ class Stage(NamedTuple):
     seconds: float
 
 
-def main() -> None:
-    """Run the command line."""
-    options = tyro.cli(Options, prog="python -m cref_jax.gpu_program")
-    with cli.one_line_errors(options.debug):
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line; a mistake in it is one line and exit code 2."""
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "gpu_program")
         c = presets.build_config(options.terrain, None, "gpu")
-        if options.num_envs:
+        if options.num_envs is not None:
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=options.num_envs))
         limits.check(c)
         card = CARDS[options.gpu]

@@ -6,7 +6,6 @@ import typing
 from dataclasses import dataclass
 
 import jax
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -23,8 +22,8 @@ class Options(cli.DebugOption):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.params")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        cli.parse(Options, arguments, "params")
         Console().print(
             build_table({name: count_parameters(name) for name in typing.get_args(config.Variant)})
         )

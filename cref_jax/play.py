@@ -7,7 +7,6 @@ import cref_jax.system.startup  # noqa: F401
 
 import dataclasses
 import functools
-import math
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -22,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from rich.progress import track
 
 from cref_jax import cli, config, network, ppo, robot
-from cref_jax.config import Config
+from cref_jax.config import Config, limits
+from cref_jax.config.ranges import Within
 from cref_jax.env import footholds
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
@@ -42,7 +42,6 @@ Level = int | Literal["easy", "medium", "hard", "ood"]
 FRAME_RATE = 25.0  # 1/s
 WIDTH, HEIGHT = 960, 540  # pixels of the video
 STILL_WIDTH = 480  # pixels of one still; its height is HEIGHT
-MAX_SECONDS = 600.0
 
 ENDINGS = {  # of an episode, by its name in state.Ending
     "tilted": "fell, tilted too far",
@@ -72,13 +71,13 @@ class Options(cli.PolicyOptions):
     """kind of lane, such as stairs_down (default: the terrain's first)"""
     level: Level | None = None
     """0 (easiest) to 9, or the name of a size of Table II (default: the middle one)"""
-    command: float = 0.6
+    command: Annotated[float, Within(-10, 10)] = 0.6
     """m/s forward"""
-    seconds: float = 10.0
+    seconds: Annotated[float, Within(0.02, 600)] = 10.0
     """length of the film; it ends earlier where the robot falls or the lane ends"""
-    seed: int = 0
+    seed: Annotated[int, limits.SEED] = 0
     """seed of the initial state and of the random agent"""
-    stills: int = 0
+    stills: Annotated[int, Within(0, 100)] = 0
     """write N stills side by side instead of a video"""
     out: Path | None = None
     """.mp4, or .png for stills (default: play.mp4 in the run's folder)"""
@@ -117,15 +116,14 @@ class Step(NamedTuple):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.play")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "play")
         jax_setup.prepare()
         play(options)
 
 
 def play(options: Options) -> None:
     """Simulate, film and summarise one episode."""
-    _check_options(options)
     if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
         jax.config.update("jax_platforms", "cpu")
     is_trained = options.agent == "trained"
@@ -229,16 +227,6 @@ def _view_policy(c: config.Network, robots: rollout.Robots, policy: network.Outp
         seen=jnp.zeros((), bool) if feed is None else feed.seen[0],
         attention=None if weights is None else weights[0, 0].mean(axis=0),
     )
-
-
-def _check_options(options: Options) -> None:
-    """Refuse options that give no film."""
-    if not 0.0 < options.seconds <= MAX_SECONDS:
-        raise ConfigError(f"--seconds must be above 0, up to {MAX_SECONDS:g}: {options.seconds:g}")
-    if not math.isfinite(options.command):
-        raise ConfigError(f"--command must be a number, m/s: {options.command}")
-    if options.stills < 0:
-        raise ConfigError(f"--stills must not be below 0: {options.stills}")
 
 
 def _build_world(options: Options, c: Config) -> World:

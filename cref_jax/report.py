@@ -2,11 +2,10 @@
 
 import cref_jax.system.startup  # noqa: F401
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import tyro
 
 from cref_jax import cli, deploy
 from cref_jax.errors import ConfigError
@@ -25,11 +24,13 @@ class Options(cli.PolicyOptions):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.report")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "report")
         if options.out:
-            markup.check_name(options.out)
+            cli.prepare_output(options.out, ".html")
         source = sources.resolve_policy(options.run, options.policy)
+        with contextlib.suppress(ConfigError):  # a damaged run still gets a page of what is left
+            print(sources.summarize(source), flush=True)
         if options.policy or (options.run is None and not sources.is_run(source)):
             out, document = options.out or Path("policy.html"), _policy_document(source)
         else:

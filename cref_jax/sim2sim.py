@@ -15,7 +15,8 @@ from rich.console import Console
 from rich.progress import track
 
 from cref_jax import cli, deploy
-from cref_jax.config import Config
+from cref_jax.config import Config, limits
+from cref_jax.config.ranges import Within
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, protocol, sim2sim_table
@@ -44,13 +45,13 @@ class Options(cli.DebugOption):
     policy: Path | None = None
     """what `python -m cref_jax.export` wrote, or its .zip (default: the bundled policy)"""
     kind: Annotated[str, tyro.conf.arg(help=f"kind of lane: {', '.join(KINDS)}")] = "flat"
-    size: float = 0.0
+    size: Annotated[float, Within(0, 100)] = 0.0
     """size of the obstacles, m; for a slope its gradient"""
-    trials: int = 100
+    trials: Annotated[int, Within(1, 1_000_000)] = 100
     """number of trials, each of up to 40 s"""
-    seed: int = 0
+    seed: Annotated[int, limits.SEED] = 0
     """seed of initial states and commands, the same as in `eval --suite cross`"""
-    latency: float = 0.02
+    latency: Annotated[float, Within(0, 10)] = 0.02
     """s from the exposure of a frame until the policy has it"""
     randomised: bool = False
     """vary the robot in each trial, with sensor noise and pushes, as `eval --suite robust` does"""
@@ -66,13 +67,9 @@ class Options(cli.DebugOption):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    options = tyro.cli(Options, args=arguments, prog="python -m cref_jax.sim2sim")
-    with cli.one_line_errors(options.debug, arguments is None):
+    with cli.one_line_errors(arguments):
+        options = cli.parse(Options, arguments, "sim2sim")
         jax_setup.prepare()
-        if options.trials < 1:
-            raise ConfigError(f"--trials must be at least 1, not {options.trials}")
-        if not options.latency >= 0.0:
-            raise ConfigError(f"--latency must not be below 0 s: {options.latency}")
         if options.film and options.table:
             raise ConfigError("--film goes with one --kind, not with --table")
         if options.film:

@@ -28,7 +28,7 @@ from cref_jax.rendering import map_plot
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
-from cref_jax.training import devices, iteration, processes, run_dir, trainer
+from cref_jax.training import devices, iteration, processes, resumption, run_dir, trainer
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
@@ -95,8 +95,8 @@ class Command:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
-    is_program, arguments = arguments is None, sys.argv[1:] if arguments is None else arguments
-    with processes.ending_together(), cli.one_line_errors("--debug" in arguments, is_program):
+    given, arguments = arguments, sys.argv[1:] if arguments is None else arguments
+    with processes.ending_together(), cli.one_line_errors(given):
         asked = _options(arguments)
         jax_setup.prepare([asked.engine])
         others = asked.coordinator, asked.num_processes, asked.process_id
@@ -120,12 +120,12 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     """
     options = _options(arguments)
     options = dataclasses.replace(options, device=select_device(options.device))
-    if options.resume:
-        run = options.run_dir or run_dir.newest()
-        base = run_dir.read_config(run)
-        _check_resumed(run, base, options, arguments)
-        run_dir.check_map(run, base.terrain.name)
-        options = dataclasses.replace(options, run_dir=run)
+    resumed = (options.run_dir or run_dir.newest()) if options.resume else None
+    if resumed:
+        base = run_dir.read_config(resumed)
+        resumption.check_origin(resumed, base, arguments, options.terrain, options.experiment)
+        run_dir.check_map(resumed, base.terrain.name)
+        options = dataclasses.replace(options, run_dir=resumed)
     else:
         base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
@@ -136,24 +136,9 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     if init:
         c = _with_init(c, options)
     limits.check(c)
+    if resumed:
+        resumption.check_settings(resumed, base, c)
     return options, c
-
-
-def _check_resumed(run: Path, base: Config, options: Options, arguments: list[str]) -> None:
-    """Refuse a terrain or an experiment that a resumed run does not have.
-
-    Raises:
-        ConfigError: says what the run has.
-    """
-    asked = {a.partition("=")[0] for a in arguments}
-    its_own = {"terrain": base.terrain.name, "experiment": run_dir.first_option(run, "experiment")}
-    for name, own in its_own.items():
-        other = getattr(options, name)
-        if f"--{name}" in asked and own is not None and other != own:
-            raise ConfigError(
-                f"{run} was begun with {name} '{own}', not '{other}'; to go on with another, begin "
-                f"a new run with --init {run}"
-            )
 
 
 def _options(arguments: list[str]) -> Options:
@@ -188,16 +173,19 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
-    run = options.run_dir or run_dir.ROOT / _name(options)
+    run_dir.check_writable(options.run_dir or run_dir.ROOT)
     mesh = devices.choose_mesh(c, options.devices)
     threads = max(parallel.cores() // len(mesh.local_devices), 1)
     # what is wrong with the terrain is said before anything is written
     world = processes.replicate(build_world(c, options.engine, threads), mesh)
+    run = options.run_dir or run_dir.reserve(_name(options))
     with lock(run) if processes.is_first() else contextlib.nullcontext():
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
+            lines = _opening_lines(run, c, options, first)
             with _open_reporter(run, c, first, options) as report:
-                report.say(_headline(run, c, options, first))
+                for line in lines:
+                    report.say(line)
                 if processes.is_first() and map_files.is_map(c.terrain.name):
                     map_plot.draw_map(world.lanes.tile(0, 0), run / "map.png")
                     report.say(f"the map, with the start: {run / 'map.png'}")
@@ -216,7 +204,7 @@ def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Report
     if not processes.is_first():
         return SilentReporter()
     run_dir.write_config(run, c)
-    run_dir.write_origin(run, first, c.terrain.name)
+    run_dir.write_origin(run, first, c.terrain.name, resolve_engine(options.engine))
     samples = c.run.num_envs * c.ppo.horizon
     return Reporter(run, first, c.run.iterations, samples, options.tensorboard)
 
@@ -270,14 +258,26 @@ def _first_state(
     return steps.restore(state, parts=("train",))[0]
 
 
-def _headline(run: Path, c: Config, options: Options, first: int) -> str:
+def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[str]:
+    """Say what is trained, what it begins as, and what is not as before in a resumed run."""
     engine = resolve_engine(options.engine)
     device = jax.devices()[0].device_kind
     start = f", from iteration {first}" if first else ""
-    return (
+    headline = (
         f"{run}: {c.terrain.name} with {c.run.num_envs} robots, engine {engine}, on {device}; "
         f"iterations {c.run.iterations}{start}"
     )
+    if options.init:
+        return [headline, f"begins as {sources.summarize(options.init)}"]
+    if not options.resume:
+        return [headline]
+    own, last = run_dir.read_config(run), run_dir.last_engine(run)
+    lines = [headline, *resumption.describe_changes(own, c)]
+    if last not in (None, engine):
+        lines.append(f"engine changes from {last} to {engine}: not bit for bit from here on")
+    if options.experiment:
+        lines += resumption.describe_unused(own, options.experiment)
+    return lines
 
 
 def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:

@@ -110,8 +110,8 @@ class Row(NamedTuple):
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a user error prints one line and exits with code 2."""
-    options = tyro.cli(Options, args=arguments)
-    with cli.one_line_errors(options.debug):
+    with cli.one_line_errors(arguments):
+        options = tyro.cli(Options, args=arguments)
         jax_setup.prepare()
         out = cli.prepare_output(options.out, ".png")
         policy, world = recorder.open_policy(options.run, options.policy, options.engine)

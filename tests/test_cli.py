@@ -1,8 +1,16 @@
 """What all commands share: errors of one line, and files that can be written."""
 
+import importlib
+import subprocess
+import sys
+import typing
+from typing import Any
+
 import pytest
+from test_layers import COMMANDS
 
 from cref_jax import cli
+from cref_jax.config.ranges import declared_ranges
 from cref_jax.errors import ConfigError, TrainingError
 
 
@@ -11,13 +19,79 @@ def test_what_a_user_can_mend_is_one_line(capsys, error, code):
     with pytest.raises(SystemExit) as end, cli.one_line_errors():
         raise error
     assert end.value.code == code and capsys.readouterr().err == "error: no\n"
-    with pytest.raises(type(error)), cli.one_line_errors(debug=True):
+    with pytest.raises(type(error)), cli.one_line_errors(["--debug"]):
         raise error
 
 
 def test_ctrl_c_leaves_a_program_that_calls_a_command_alive():
-    with pytest.raises(KeyboardInterrupt), cli.one_line_errors(is_program=False):
+    with pytest.raises(KeyboardInterrupt), cli.one_line_errors([]):
         raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (PermissionError(13, "Permission denied", "runs/a"), "runs/a: Permission denied"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line_with_the_file(capsys, error, says):
+    with pytest.raises(SystemExit) as end, cli.one_line_errors([]):
+        raise error
+    assert end.value.code == 2 and capsys.readouterr().err == f"error: {says}\n"
+
+
+def test_a_command_ends_quietly_when_nobody_reads_its_output():
+    program = (
+        "from cref_jax import cli\n"
+        "with cli.one_line_errors():\n"
+        "    for number in range(100_000): print(number)\n"
+    )
+    run = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert run.stdout and run.stderr
+    assert run.stdout.readline() == b"0\n"
+    run.stdout.close()
+    assert (run.wait(timeout=60), run.stderr.read()) == (141, b"")
+    run.stderr.close()
+
+
+CHECKED_ELSEWHERE = {  # short for settings, or bounded by the machine or the terrain
+    "train": {"num_envs", "iterations", "seed", "devices", "num_processes", "process_id"},
+    "play": {"level"},
+}
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_number_of_every_command_has_a_range(command):
+    options = importlib.import_module(f"cref_jax.{command}").Options
+    hints = typing.get_type_hints(options)
+    numbers = {name for name, hint in hints.items() if holds_numbers(hint)}
+    assert numbers - CHECKED_ELSEWHERE.get(command, set()) <= declared_ranges(options).keys()
+
+
+def holds_numbers(hint: Any) -> bool:
+    """Check whether a type is a number or made of some."""
+    return hint in (int, float) or any(map(holds_numbers, typing.get_args(hint)))
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "says"),
+    [
+        ("eval", ["--num-envs", "0"], "--num-envs must be 1 to 1000000, not 0"),
+        ("eval", ["--size", "nan"], "--size must be 0 to 100, not nan"),
+        ("sim2sim", ["--trials", "-1"], "--trials must be 1 to 1000000, not -1"),
+        ("sim2sim", ["--latency", "inf"], "--latency must be 0 to 10, not inf"),
+        ("play", ["--seed", "4294967296"], "--seed must be 0 to 4294967295, not 4294967296"),
+        ("bench", ["--num-envs", "8", "0"], "--num-envs must be 1 to 1000000, not 8 0"),
+        ("gpu_program", ["--num-envs", "-4"], "--num-envs must be 1 to 1000000, not -4"),
+    ],
+)
+def test_a_number_out_of_its_range_is_one_line(capsys, command, arguments, says):
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f"cref_jax.{command}").main(arguments)
+    assert end.value.code == 2 and capsys.readouterr().err == f"error: {says}\n"
 
 
 def test_a_file_to_write_gets_its_folder_and_must_end_right(tmp_path):

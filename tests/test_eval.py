@@ -24,7 +24,7 @@ def said(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--num-envs", "0"], "--num-envs must be at least 1, not 0"),
+        (["--num-envs", "0"], "--num-envs must be 1 to 1000000, not 0"),
         (["--run", "a", "--policy", "b"], "give --run or --policy, not both"),
         (["--suite", "ood", "--policy", "a", "b"], "--suite ood takes one run or policy, not 2"),
         (["--film", "curbs"], "--film takes a scene of --suite ood"),

@@ -19,8 +19,8 @@ FILES = sorted(PACKAGE.glob("**/*.py"))
 
 FLOORS = [
     {"errors", "geometry", "geoms", "runtime", "system"},
-    {"config", "cli", "deploy"},
-    {"robot", "terrain", "network", "ppo"},
+    {"config", "deploy"},
+    {"cli", "robot", "terrain", "network", "ppo"},
     {"physics", "depth", "rendering", "pages"},
     {"env"},
     {"training", "whole_body"},

@@ -174,8 +174,8 @@ def test_markup_in_names_and_settings_stays_text(run):
         (["--run", "{}/nothing"], "nothing is not a run: it has no config.json"),
         (["--run", "{}/file"], "file is not a run: it has no config.json"),
         (["--policy", "{}/nothing"], "nothing"),
-        (["--run", "{}/run", "--out", "{}/a.pdf"], "the name of a page must end in .html"),
-        (["--run", "{}/run", "--out", "{}/file/a.html"], "cannot write"),
+        (["--run", "{}/run", "--out", "{}/a.pdf"], "--out must end in .html"),
+        (["--run", "{}/run", "--out", "{}/file/a.html"], "cannot make the folder"),
         (["--run", "{}/run", "--policy", "{}/run"], "give --run or --policy, not both"),
     ],
 )

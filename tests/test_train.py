@@ -16,8 +16,9 @@ from cref_jax import config, export, train
 from cref_jax.env.world import build_world
 from cref_jax.errors import CheckpointError, ConfigError
 from cref_jax.policy import reader, sources, trained, writer
-from cref_jax.training import devices, iteration, run_dir
+from cref_jax.training import devices, iteration, resumption, run_dir
 from cref_jax.training.checkpoint import Checkpoints
+from cref_jax.training.progress import Reporter
 
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
 TINY += ["--no-tensorboard", "--no-evaluate"]
@@ -58,6 +59,64 @@ def test_a_resumed_run_keeps_its_terrain_and_its_experiment(first, tmp_path):
         train.parse([*resume, "--experiment=full"])
 
 
+@pytest.mark.parametrize(
+    ("setting", "value", "says"),
+    [
+        ("--ppo.gamma", "0.9", "--ppo.gamma 0.99, not 0.9"),
+        ("--seed", "3", "--run.seed 0, not 3"),
+        ("--reward.weights.stumble", "-1", "--reward.weights.stumble -10.0, not -1.0"),
+        ("--network.actor", "64", r"--network.actor \(32,\), not \(64,\)"),
+    ],
+)
+def test_a_resumed_run_keeps_its_settings(first, setting, value, says):
+    with pytest.raises(ConfigError, match=f"was begun with {says}; .* with --init {first}"):
+        train.parse(["--resume", "--run-dir", str(first), setting, value])
+
+
+def test_a_resumed_run_says_what_changes_and_what_is_not_taken(first, tmp_path):
+    arguments = ["--resume", "--run-dir", str(first), "--iterations", "9", "--run.keep", "1"]
+    _, c = train.parse([*arguments, "--run.checkpoint-minutes", "2", "--num-envs", "4"])
+    assert resumption.describe_changes(run_dir.read_config(first), c) == [
+        "--run.num-envs changes from 8 to 4",
+        "--run.iterations changes from 2 to 9",
+        "--run.checkpoint-minutes changes from 5.0 to 2.0",
+        "--run.keep changes from 3 to 1",
+    ]
+    (tmp_path / "mine.toml").write_text("[ppo]\ngamma = 0.5\n")
+    assert resumption.describe_unused(c, str(tmp_path / "mine.toml")) == [
+        f"{tmp_path}/mine.toml has --ppo.gamma 0.5, and the run goes on with 0.99"
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), SystemExit(1)])
+def test_an_error_between_two_chunks_loses_nothing(tmp_path, monkeypatch, error):
+    whole = Reporter.chunk
+
+    def chunk(report, done, log, seconds):
+        whole(report, done, log, seconds)
+        if done == 1:
+            raise error
+
+    monkeypatch.setattr(Reporter, "chunk", chunk)
+    with pytest.raises(SystemExit):
+        run(tmp_path / "run", "--iterations", "9")
+    assert Checkpoints(tmp_path / "run" / "checkpoints").latest() == 2
+
+
+@pytest.mark.slow
+def test_what_is_not_sound_is_not_saved(tmp_path, monkeypatch):
+    def chunk(report, done, log, seconds):
+        log["episode/unstable"] = log["episode/unstable"] + 100.0
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Reporter, "chunk", chunk)
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path / "run")
+    assert end.value.code == 1
+    assert Checkpoints(tmp_path / "run" / "checkpoints").latest() is None
+
+
 def test_robots_of_another_version_begin_anew_and_what_was_learned_stays(
     first, tmp_path, monkeypatch, capsys
 ):
@@ -94,11 +153,12 @@ def state_of(folder: Path) -> list[np.ndarray]:
     [
         (["--terrain", "gpa"], "did you mean 'gap'?"),
         (["--experiment", "smok"], "did you mean 'smoke'?"),
-        (["--num-envs", "0"], "'run.num_envs' must be at least 1, not 0"),
+        (["--num-envs", "0"], "--run.num-envs must be 1 to 1000000, not 0"),
         (["--num-envs", "510"], "take 508 or 512"),
-        (["--iterations", "-3"], "'run.iterations' must be at least 1"),
-        (["--physics.timestep", "1.0"], "'physics.timestep' must be"),
+        (["--iterations", "-3"], "--run.iterations must be 1 to 10000000, not -3"),
+        (["--physics.timestep", "1.0"], "--physics.timestep must be"),
         (["--resume", "--run-dir", "nowhere"], "nowhere is not a run"),
+        (["--run-dir", "/dev/null/run"], "cannot write in /dev/null/run: /dev/null is a file"),
         (["--num-processes", "2"], "give --coordinator, --num-processes and --process-id, or none"),
         (
             ["--coordinator", "a:1", "--num-processes", "2", "--process-id", "2"],

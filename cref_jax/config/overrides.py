@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import re
 import tomllib
 import types
 import typing
@@ -11,14 +12,20 @@ from typing import Any, Literal, TypeVar
 from cref_jax.errors import ConfigError
 
 C = TypeVar("C")
+DEEPEST = 16  # tables within each other; no file needs more than three
+TOO_DEEP = re.compile(rf"(?:\.[ \t]*[\w\"'-]+[ \t]*){{{DEEPEST}}}")
+"""Keys that tomllib takes gigabytes for"""
 
 
-def override(config: C, changes: dict[str, Any], where: str = "") -> C:
+def override(config: C, changes: Any, where: str = "") -> C:
     """Apply nested `changes` to `config`.
 
     Raises:
         ConfigError: a key that does not exist (the nearest one is named), or a bad value.
     """
+    if not isinstance(changes, dict):
+        name = f"'{where.removesuffix('.')}'" if where else "what is here"
+        raise ConfigError(f"{name} is a table of settings, not {changes!r}")
     hints = typing.get_type_hints(type(config))
     values: dict[str, Any] = {}
     for key, value in changes.items():
@@ -26,8 +33,6 @@ def override(config: C, changes: dict[str, Any], where: str = "") -> C:
         if key not in hints:
             raise ConfigError(describe_unknown("setting", key, list(hints), where))
         if dataclasses.is_dataclass(hints[key]):
-            if not isinstance(value, dict):
-                raise ConfigError(f"'{path}' is a table of settings, not {value!r}")
             values[key] = override(getattr(config, key), value, where=f"{path}.")
         else:
             values[key] = _check_value(value, hints[key], path)
@@ -51,7 +56,12 @@ def load_toml(path: Path) -> dict[str, Any]:
         ConfigError: the file is missing or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if TOO_DEEP.search(text):
+            raise ConfigError(f"{path}: more than {DEEPEST} tables within each other")
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{path}: too many tables or lists within each other") from None
     except FileNotFoundError:
         raise ConfigError(f"no file {path}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:

@@ -11,8 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from cref_jax import config
-from cref_jax.config import Config
+from cref_jax.config import Config, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy.trained import TrainedPolicy
@@ -49,7 +48,16 @@ def read_config(path: Path) -> Config:
     Raises:
         ConfigError: it is not a learner file, or from another version of the program.
     """
-    return config.override(Config(), json.loads(str(_load_arrays(path)[_SETTINGS])))
+    return presets.apply_table(Config(), json.loads(str(_load_arrays(path)[_SETTINGS])), path)
+
+
+def read_iteration(path: Path) -> int:
+    """Read how many iterations it was trained for.
+
+    Raises:
+        ConfigError: it is not a learner file.
+    """
+    return int(_load_arrays(path)[_ITERATION])
 
 
 def read(path: Path, world: World) -> TrainedPolicy:

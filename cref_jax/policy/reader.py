@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cref_jax import config, deploy
-from cref_jax.config import Config
+from cref_jax import deploy
+from cref_jax.config import Config, presets
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.policy.trained import TrainedPolicy
@@ -66,4 +66,4 @@ def read_contents(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def trained_config(content: dict[str, Any]) -> Config:
     """Read the settings that an exported policy was trained with from its manifest."""
-    return config.override(Config(), content["provenance"]["config"])
+    return presets.apply_table(Config(), content["provenance"]["config"], Path("manifest.json"))

@@ -7,7 +7,7 @@ from cref_jax.config import Config, folders
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, reader, trained
-from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.policy.trained import TrainedPolicy, count_samples
 from cref_jax.training import run_dir
 
 BUNDLED = "mixed"  # the policy included in the package
@@ -62,9 +62,26 @@ def read_config(path: Path) -> Config:
 
 def describe(path: Path, policy: TrainedPolicy) -> str:
     """Say in one line which policy it is, and what it was trained on for how long."""
-    c = policy.config
+    return _line(path, policy.config, policy.iteration)
+
+
+def summarize(path: Path) -> str:
+    """Say the same of a policy that is not loaded.
+
+    Raises:
+        ConfigError: it is neither a run nor a policy.
+    """
+    c = read_config(path)
+    if learner_file.is_learner(path):
+        return _line(path, c, learner_file.read_iteration(path))
+    if is_run(path):
+        return _line(path, c, run_dir.checkpoints(path).latest() or 0)
+    return _line(path, c, reader.read_contents(path)[0]["provenance"]["iteration"])
+
+
+def _line(path: Path, c: Config, iteration: int) -> str:
     sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
-    samples = f"{policy.samples / 1e6:.1f} M samples"
+    samples = f"{count_samples(c, iteration) / 1e6:.1f} M samples"
     return f"{path}: {sees}, trained on {c.terrain.name} for {samples}"
 
 

@@ -22,7 +22,12 @@ class TrainedPolicy(NamedTuple):
     @property
     def samples(self) -> int:
         """Control steps of training experience."""
-        return self.iteration * self.config.run.num_envs * self.config.ppo.horizon
+        return count_samples(self.config, self.iteration)
+
+
+def count_samples(c: Config, iteration: int) -> int:
+    """Count the control steps of training experience in this many iterations."""
+    return iteration * c.run.num_envs * c.ppo.horizon
 
 
 def load_policy(run: Path, world: World) -> TrainedPolicy:

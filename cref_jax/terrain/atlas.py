@@ -13,7 +13,6 @@ from cref_jax.terrain import column_grid
 from cref_jax.terrain.column_grid import Grid, Terrain
 
 MAX_COLUMNS = 2e8  # per grid; 0.8 GB; assumed
-LEAST_CELL = 0.01  # m; contact looks 3 cells far for a wall, and a shank has a radius of 2 cm
 
 
 @no_type_check  # vmap and tree.map put batches and non-arrays in it

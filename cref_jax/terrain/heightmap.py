@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from cref_jax import config
+from cref_jax.config import limits
 from cref_jax.errors import ConfigError
-from cref_jax.terrain import atlas, column_grid, kind_files, map_files
+from cref_jax.terrain import column_grid, kind_files, map_files
 from cref_jax.terrain.atlas import Atlas
 
 MAP_START = 0.75  # m, x of the map's start in the lane's coordinates; assumed: within START
@@ -64,9 +65,9 @@ def _read_settings(path: Path) -> _MapFile:
     )
     if not np.isfinite([file.cell, *file.start, file.scale]).all():
         raise ConfigError(f"{file_path.name}: cell, start and scale must be finite")
-    if not file.cell >= atlas.LEAST_CELL:
+    if not file.cell >= limits.LEAST_CELL:
         raise ConfigError(
-            f"{file_path.name}: cell must be at least {atlas.LEAST_CELL} m, not {file.cell}: "
+            f"{file_path.name}: cell must be at least {limits.LEAST_CELL} m, not {file.cell}: "
             "contact looks three cells far for a wall; thin the map out"
         )
     if file.scale == 0.0:

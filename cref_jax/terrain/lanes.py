@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cref_jax import config
+from cref_jax.config import limits
 from cref_jax.errors import ConfigError
 from cref_jax.terrain import atlas, column_grid, heightmap, kind_files, map_files
 from cref_jax.terrain.atlas import Atlas
@@ -116,5 +117,5 @@ def _check_lane(c: config.Terrain) -> None:
         raise ConfigError(
             "a terrain's cell, lane_length, lane_width, levels and variants must be above zero"
         )
-    if c.cell < atlas.LEAST_CELL:
-        raise ConfigError(f"'terrain.cell' must be at least {atlas.LEAST_CELL} m, not {c.cell}")
+    if c.cell < limits.LEAST_CELL:
+        raise ConfigError(f"'terrain.cell' must be at least {limits.LEAST_CELL} m, not {c.cell}")

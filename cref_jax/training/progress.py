@@ -1,5 +1,6 @@
 """Progress of a run: a live display on a terminal, plain lines elsewhere, and log files."""
 
+import contextlib
 import json
 import time
 from collections.abc import Mapping
@@ -63,11 +64,12 @@ class Reporter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._live:
-            self._live.stop()
-        if self._board:
-            self._board.close()
-        self._file.close()
+        with contextlib.ExitStack() as closing:  # each, even where the terminal is gone
+            closing.callback(self._file.close)
+            if self._board:
+                closing.callback(self._board.close)
+            if self._live:
+                closing.callback(self._live.stop)
 
     def say(self, line: str) -> None:
         """Print one line above the table."""

@@ -7,9 +7,11 @@ runs/NAME/tensorboard/    the same for TensorBoard
 runs/NAME/checkpoints/    see checkpoint.py
 """
 
+import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -21,8 +23,7 @@ from typing import Any
 
 import jax
 
-from cref_jax import config
-from cref_jax.config import Config
+from cref_jax.config import Config, presets
 from cref_jax.errors import ConfigError
 from cref_jax.terrain import map_files
 from cref_jax.training.checkpoint import Checkpoints
@@ -35,7 +36,7 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path, iteration: int = 0, terrain: str = "") -> None:
+def write_origin(run: Path, iteration: int = 0, terrain: str = "", engine: str = "") -> None:
     """Append a line with the origin of this start: versions, device, command and git state.
 
     `iteration` is the number of iterations done before it, `terrain` a name or a map's file.
@@ -46,6 +47,7 @@ def write_origin(run: Path, iteration: int = 0, terrain: str = "") -> None:
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
         **machine(),
+        "engine": engine,
         "git": _git_state(),
         **({"map": map_files.digest(Path(terrain))} if map_files.is_map(terrain) else {}),
         **versions(),
@@ -75,14 +77,11 @@ def read_config(run: Path) -> Config:
     path = run / "config.json"
     try:
         changes = json.loads(path.read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(f"{run} is not a run: it has no config.json") from None
-    except json.JSONDecodeError as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: {error}") from None
-    try:
-        return config.override(Config(), changes)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    return presets.apply_table(Config(), changes, path)
 
 
 def check_map(run: Path, terrain: str) -> None:
@@ -91,7 +90,7 @@ def check_map(run: Path, terrain: str) -> None:
     Raises:
         ConfigError: the map or its settings have changed.
     """
-    began_on = _first_origin(run).get("map")
+    began_on = _read_origin(run, 0).get("map")
     if began_on and map_files.is_map(terrain) and map_files.digest(Path(terrain)) != began_on:
         raise ConfigError(
             f"{terrain} or the .toml beside it has changed since {run} began; begin a new run on "
@@ -99,22 +98,51 @@ def check_map(run: Path, terrain: str) -> None:
         )
 
 
-def _first_origin(run: Path) -> dict[str, Any]:
+def last_engine(run: Path) -> str | None:
+    """Read the engine of a run's last start, None if it is not recorded."""
+    return _read_origin(run, -1).get("engine")
+
+
+def _read_origin(run: Path, start: int) -> dict[str, Any]:
     try:
-        return json.loads((run / "origin.jsonl").read_text().splitlines()[0])
+        return json.loads((run / "origin.jsonl").read_text().splitlines()[start])
     except (OSError, ValueError, IndexError):
         return {}
 
 
 def first_option(run: Path, name: str) -> str | None:
     """Read an option from the command line that began a run, None if it was not given."""
-    command = _first_origin(run).get("command", [])
+    command = _read_origin(run, 0).get("command", [])
     for word, following in pairwise([*command, ""]):
         if word == f"--{name}":
             return following
         if word.startswith(f"--{name}="):
             return word.partition("=")[2]
     return None
+
+
+def check_writable(folder: Path) -> None:
+    """Check, without creating anything, that files can be written in a folder.
+
+    Raises:
+        ConfigError: it cannot be made or written.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise ConfigError(f"cannot write in {folder}: {there} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"cannot write in {folder}: no permission for {there}")
+
+
+def reserve(name: str) -> Path:
+    """Create the folder of a new run, with a number after its name where another run has it."""
+    ROOT.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        run = ROOT / (name if number == 1 else f"{name}-{number}")
+        with contextlib.suppress(FileExistsError):
+            run.mkdir()
+            return run
+    raise AssertionError("one of all numbers is free")
 
 
 def newest(root: Path = ROOT) -> Path:

@@ -1,5 +1,6 @@
 """The training loop: compiled chunks, with checkpoints and health checks in between."""
 
+import contextlib
 import time
 from collections.abc import Mapping
 
@@ -61,7 +62,7 @@ def run_chunks(
     report: Reporter | SilentReporter,
     programs: Programs,
 ) -> iteration.RunState:
-    """Train chunk by chunk; save in between, at the end, and on a request to stop."""
+    """Train chunk by chunk; save in between, at the end, when asked to stop, and on an error."""
     c = world.config
     done = int(state.train.iteration)
     if done >= c.run.iterations:
@@ -70,19 +71,27 @@ def run_chunks(
     saved = time.monotonic()
     stops = False
     with interrupts.StopRequest() as stop:
-        while done < c.run.iterations and not stops:
-            program = programs.get(min(c.run.chunk, c.run.iterations - done))
-            started_at = time.monotonic()
-            state, log = program(world, state)
-            log = {name: np.asarray(values) for name, values in log.items()}
-            report.chunk(done, log, time.monotonic() - started_at)
-            check_health(log, c.run.num_envs * c.ppo.horizon)
-            done = int(state.train.iteration)
-            is_due = time.monotonic() - saved > 60 * c.run.checkpoint_minutes
-            stops, is_due = processes.any_says(stop.requested, is_due)
-            if is_due:
-                _save(steps, state, done, programs.mesh)
-                saved = time.monotonic()
+        try:
+            while done < c.run.iterations and not stops:
+                program = programs.get(min(c.run.chunk, c.run.iterations - done))
+                started_at = time.monotonic()
+                state, log = program(world, state)
+                log = {name: np.asarray(values) for name, values in log.items()}
+                try:
+                    report.chunk(done, log, time.monotonic() - started_at)
+                finally:  # what is not sound is not saved, whatever else fails
+                    check_health(log, c.run.num_envs * c.ppo.horizon)
+                done = int(state.train.iteration)
+                is_due = time.monotonic() - saved > 60 * c.run.checkpoint_minutes
+                stops, is_due = processes.any_says(stop.requested, is_due)
+                if is_due:
+                    _save(steps, state, done, programs.mesh)
+                    saved = time.monotonic()
+        except (errors.TrainingError, errors.CheckpointError):
+            raise
+        except (Exception, SystemExit):  # rich's answer to a closed pipe is SystemExit
+            _rescue(steps, state, report, programs.mesh)
+            raise
         _save(steps, state, done, programs.mesh)
     if stops:
         report.say(f"stopped and saved at iteration {done}")
@@ -92,6 +101,18 @@ def run_chunks(
 def _save(steps: Checkpoints, state: iteration.RunState, done: int, mesh: Mesh) -> None:
     steps.save(done, state, describe_sharding(state, mesh))
     processes.wait_for_all()
+
+
+def _rescue(
+    steps: Checkpoints, state: iteration.RunState, report: Reporter | SilentReporter, mesh: Mesh
+) -> None:
+    """Save what was learned before an error, unless it struck within a chunk or other processes."""
+    if jax.process_count() > 1 or any(leaf.is_deleted() for leaf in jax.tree.leaves(state)):
+        return
+    done = int(state.train.iteration)
+    _save(steps, state, done, mesh)
+    with contextlib.suppress(OSError):  # the terminal may be gone
+        report.say(f"saved at iteration {done}, before an error")
 
 
 def describe_sharding(state: iteration.RunState, mesh: Mesh) -> dict[str, int]:

@@ -63,15 +63,15 @@ def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"camera": {"shape": [58, 88]}}, "'camera.shape': 58 rows do not split .* take 56"),
+        ({"camera": {"shape": [58, 88]}}, "--camera.shape: 58 rows do not split .* take 56"),
         ({"camera": {"shape": [48, 87]}}, "87 columns do not split .* take 88"),
-        ({"network": {"heads": 3}}, "'network.token', 128, does not split into 3 heads"),
-        ({"network": {"initial_std": -1.0}}, "'network.initial_std' must be above 0"),
-        ({"ppo": {"gamma": 1.5}}, "'ppo.gamma' must be 0 to 1, not 1.5"),
-        ({"ppo": {"learning_rate": float("nan")}}, "'ppo.learning_rate' must be above 0"),
-        ({"foothold": {"stride": 0}}, "'foothold.stride' must be at least 1, not 0"),
-        ({"scan": {"x": [0.0, 1.0, 0]}}, "'scan.x' must be from, to, samples"),
-        ({"run": {"seed": 2**32}}, "'run.seed' must be 0 to 4294967295"),
+        ({"network": {"heads": 3}}, "--network.token, 128, does not split into 3 heads"),
+        ({"network": {"initial_std": -1.0}}, "--network.initial-std must be 0.001 to 10, not -1"),
+        ({"ppo": {"gamma": 1.5}}, "--ppo.gamma must be 0 to 1, not 1.5"),
+        ({"ppo": {"learning_rate": float("nan")}}, "--ppo.learning-rate must be .*, not nan"),
+        ({"foothold": {"stride": 0}}, "--foothold.stride must be 1 to 1000, not 0"),
+        ({"scan": {"x": [0.0, 1.0, 0]}}, "--scan.x must be from, to, samples"),
+        ({"run": {"seed": 2**32}}, "--run.seed must be 0 to 4294967295"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_is_compiled(changes, says):

@@ -46,5 +46,31 @@ def test_an_option_is_read_from_the_command_that_began_a_run(tmp_path, command, 
     assert run_dir.first_option(tmp_path, "experiment") == value
 
 
+def test_runs_of_one_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runs = [run_dir.reserve("flat-20261127-101500") for _ in range(3)]
+    assert [run.name[-6:] for run in runs] == ["101500", "1500-2", "1500-3"]
+    assert all(run.is_dir() for run in runs)
+
+
+def test_a_folder_that_cannot_be_written_is_named_and_nothing_is_made(tmp_path, monkeypatch):
+    run_dir.check_writable(tmp_path / "new" / "run")
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
+        with pytest.raises(ConfigError, match=f"cannot write in {folder}: .*file is a file"):
+            run_dir.check_writable(folder)
+    monkeypatch.setattr(run_dir.os, "access", lambda *_: False)
+    with pytest.raises(ConfigError, match=f"no permission for {tmp_path}$"):
+        run_dir.check_writable(tmp_path / "new" / "run")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_engine_of_the_last_start_is_remembered(tmp_path):
+    assert run_dir.last_engine(tmp_path) is None
+    for engine in ("mujoco", "warp"):
+        run_dir.write_origin(tmp_path, engine=engine)
+    assert run_dir.last_engine(tmp_path) == "warp"
+
+
 def test_a_run_without_a_first_command_gave_no_option(tmp_path):
     assert run_dir.first_option(tmp_path, "experiment") is None

@@ -1,0 +1,91 @@
+"""What a resumed run may change, and what would make it another run."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from cref_jax.config import Config, presets
+from cref_jax.errors import ConfigError
+from cref_jax.training import run_dir
+
+MAY_CHANGE = (
+    "run.iterations",
+    "run.chunk",
+    "run.checkpoint_minutes",
+    "run.keep",
+    "run.num_envs",  # what was learned goes on, with fresh robots
+)
+
+
+def check_origin(
+    run: Path, own: Config, arguments: Sequence[str], terrain: str, experiment: str | None
+) -> None:
+    """Refuse a terrain or an experiment on the command line that the run was not begun with.
+
+    Raises:
+        ConfigError: says what the run has.
+    """
+    asked = {a.partition("=")[0] for a in arguments}
+    began_with = {
+        "terrain": own.terrain.name,
+        "experiment": run_dir.first_option(run, "experiment"),
+    }
+    for name, other in {"terrain": terrain, "experiment": experiment}.items():
+        began = began_with[name]
+        if f"--{name}" in asked and began is not None and other != began:
+            raise ConfigError(
+                f"{run} was begun with {name} '{began}', not '{other}'; to go on with another, "
+                f"begin a new run with --init {run}"
+            )
+
+
+def check_settings(run: Path, own: Config, asked: Config) -> None:
+    """Refuse settings with which the run would be another one.
+
+    Raises:
+        ConfigError: names each, with the run's value and the one asked for.
+    """
+    fixed = [x for x in _find_differences(own, asked) if x[0] not in MAY_CHANGE]
+    if fixed:
+        each = "; ".join(f"{_option(name)} {old}, not {new}" for name, old, new in fixed)
+        raise ConfigError(
+            f"{run} was begun with {each}; to go on with other settings, begin a new run with "
+            f"--init {run}"
+        )
+
+
+def describe_changes(own: Config, asked: Config) -> list[str]:
+    """Say in a line each which settings change from here on."""
+    return [
+        f"{_option(name)} changes from {old} to {new}"
+        for name, old, new in _find_differences(own, asked)
+    ]
+
+
+def describe_unused(own: Config, experiment: str) -> list[str]:
+    """Say in a line each which settings of an experiment's file are not those of the run."""
+    file = presets.experiment_file(experiment)
+    asked = presets.apply_file(own, experiment)
+    return [
+        f"{file} has {_option(name)} {new}, and the run goes on with {old}"
+        for name, old, new in _find_differences(own, asked)
+    ]
+
+
+def _find_differences(own: Any, other: Any, where: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the dotted name and both values of each setting that differs."""
+    for field in dataclasses.fields(own):
+        name, old, new = (
+            f"{where}{field.name}",
+            getattr(own, field.name),
+            getattr(other, field.name),
+        )
+        if dataclasses.is_dataclass(old):
+            yield from _find_differences(old, new, f"{name}.")
+        elif old != new:
+            yield name, old, new
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
