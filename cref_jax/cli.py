@@ -55,8 +55,8 @@ def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
     """
     is_program = arguments is None
     try:
-        yield
-        sys.stdout.flush()
+        with _flushed():
+            yield
     except BrokenPipeError:
         if not is_program:
             raise
@@ -75,6 +75,17 @@ def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
         os._exit(130)  # at once: a running XLA program may still call into this interpreter
 
 
+@contextlib.contextmanager
+def _flushed() -> Iterator[None]:
+    """Flush stdout where all went well, --help included, so that a closed pipe is noticed here."""
+    try:
+        yield
+    except SystemExit:
+        sys.stdout.flush()
+        raise
+    sys.stdout.flush()
+
+
 def _one_line(error: Exception) -> str:
     """Return what an error says; what the system refuses comes with the file that it is about."""
     if not isinstance(error, OSError) or error.strerror is None:
@@ -91,8 +102,13 @@ def prepare_output(out: Path, suffix: str, option: str = "--out") -> Path:
     if out.suffix != suffix:
         raise ConfigError(f"{option} must end in {suffix}: {out}")
     prepare_folder(out.parent)
-    if out.is_dir() or not os.access(out if out.exists() else out.parent, os.W_OK):
-        raise ConfigError(f"cannot write {out}")
+    is_new = not out.exists()
+    try:
+        out.open("ab").close()  # permissions alone do not tell, such as root's or on a network disk
+        if is_new:
+            out.unlink()
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}") from None
     return out
 
 

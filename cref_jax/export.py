@@ -36,15 +36,15 @@ def main(arguments: list[str] | None = None) -> None:
         if not options.out.name:
             raise ConfigError(f"--out must be a folder with a name, not {options.out}")
         if options.learner:
-            _write_learner(
-                options.run or run_dir.newest(),
-                cli.prepare_output(options.learner, ".npz", "--learner"),
-            )
+            out = cli.prepare_output(options.learner, ".npz", "--learner")
+            _write_learner(options.run or run_dir.newest(), out)
             return
         cli.prepare_output(options.out.with_name(options.out.name + ".zip"), ".zip")
-        cli.prepare_folder(options.out)
+        run_dir.check_writable(options.out)
         if options.policy:
-            writer.copy(sources.resolve_policy(options.run, options.policy), options.out)
+            source = sources.resolve_policy(options.run, options.policy)
+            print(sources.summarize(source), flush=True)
+            writer.copy(source, options.out)
         else:
             _export(options)
         times = deploy.self_test(options.out)
@@ -68,6 +68,7 @@ def _export(options: Options) -> None:
 def _write_learner(run: Path, out: Path) -> None:
     """Write actor, critic and optimizer of the run."""
     world = build_world(run_dir.read_config(run), "mujoco")
+    print(sources.summarize(run), flush=True)
     learner_file.write(trained.load_policy(run, world), out)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; python -m cref_jax.train --init {out}")
 

@@ -178,7 +178,8 @@ def train(options: Options, c: Config) -> None:
     threads = max(parallel.cores() // len(mesh.local_devices), 1)
     # what is wrong with the terrain is said before anything is written
     world = processes.replicate(build_world(c, options.engine, threads), mesh)
-    run = options.run_dir or run_dir.reserve(_name(options))
+    name = run_dir.reserve if processes.is_first() else run_dir.ROOT.joinpath
+    run = options.run_dir or name(_name(options))
     with lock(run) if processes.is_first() else contextlib.nullcontext():
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)

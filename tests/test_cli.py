@@ -41,20 +41,25 @@ def test_what_the_system_refuses_is_one_line_with_the_file(capsys, error, says):
     assert end.value.code == 2 and capsys.readouterr().err == f"error: {says}\n"
 
 
-def test_a_command_ends_quietly_when_nobody_reads_its_output():
+@pytest.mark.parametrize("ends", ["pass", "sys.exit(0)"])  # as after --help
+@pytest.mark.parametrize("lines", [1, 100_000])  # fewer and more than a pipe holds
+def test_a_command_ends_quietly_when_nobody_reads_its_output(ends, lines):
     program = (
+        "import sys\n"
         "from cref_jax import cli\n"
         "with cli.one_line_errors():\n"
-        "    for number in range(100_000): print(number)\n"
+        "    sys.stdin.read()\n"
+        f"    for number in range({lines}): print(number)\n"
+        f"    {ends}\n"
     )
-    run = subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-    assert run.stdout and run.stderr
-    assert run.stdout.readline() == b"0\n"
-    run.stdout.close()
-    assert (run.wait(timeout=60), run.stderr.read()) == (141, b"")
-    run.stderr.close()
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=pipe, stdout=pipe, stderr=pipe
+    ) as run:
+        assert run.stdin and run.stdout and run.stderr
+        run.stdout.close()
+        run.stdin.close()
+        assert (run.wait(timeout=60), run.stderr.read()) == (141, b"")
 
 
 CHECKED_ELSEWHERE = {  # short for settings, or bounded by the machine or the terrain
@@ -92,6 +97,32 @@ def test_a_number_out_of_its_range_is_one_line(capsys, command, arguments, says)
     with pytest.raises(SystemExit) as end:
         importlib.import_module(f"cref_jax.{command}").main(arguments)
     assert end.value.code == 2 and capsys.readouterr().err == f"error: {says}\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        ("eval", "--out", "results"),
+        ("play", "--out", "play.mp4"),
+        ("export", "--out", "policy"),
+        ("export", "--learner", "learned.npz"),
+        ("sim2sim", "--out", "result.json"),
+        ("sim2sim", "--film", "film.mp4"),
+        ("report", "--out", "page.html"),
+        ("bench", "--out", "bench.json"),
+    ],
+)
+def test_a_result_that_cannot_be_written_is_refused_before_the_work(
+    tmp_path, monkeypatch, capsys, command, option, name
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f"cref_jax.{command}").main([option, f"file/{name}"])
+    said = capsys.readouterr()
+    assert (end.value.code, said.out) == (2, "")
+    assert said.err.startswith("error: cannot make the folder file") and said.err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_file_to_write_gets_its_folder_and_must_end_right(tmp_path):

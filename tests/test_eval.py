@@ -46,6 +46,11 @@ def test_the_bundled_policy_is_judged_where_there_is_no_run(tmp_path, monkeypatc
     assert eval._resolve_sources(Options()) == [sources.bundled_policy()]
 
 
+def test_a_policy_of_flat_ground_is_judged_on_flat_ground():
+    assert eval._suite_for(["flat"]) == "walk"
+    assert eval._suite_for(["mixed"]) == eval._suite_for(["flat", "flat"]) == "table"
+
+
 def test_an_evaluation_of_another_suite_is_kept(tmp_path):
     walk = {"suite": "walk", "episodes": 2, "fell": 1}
     cross = {"suite": "cross", "trials": 4, "successes": 3}

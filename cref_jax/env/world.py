@@ -9,11 +9,13 @@ from jaxtyping import PRNGKeyArray
 
 from cref_jax import robot as robots
 from cref_jax import terrain
-from cref_jax.config import Config
+from cref_jax.config import Config, describe_unknown
+from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Body, EngineName
 from cref_jax.physics.simulation import Physics, resolve_engine
 from cref_jax.terrain import lanes
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.terrain.generators import KINDS
 
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
@@ -31,10 +33,25 @@ def make_world(c: Config, physics: Physics) -> World:
     """Build the terrain and settle the states that episodes start from.
 
     Raises:
-        ConfigError: the terrain is unknown or its numbers cannot be used.
+        ConfigError: the terrain is unknown, or its numbers or those of the starts cannot be used.
     """
-    c = robots.fill_in(c)
-    return World(c, physics, lanes.build(c.terrain), _settle_robots(c, physics))
+    c, atlas = robots.fill_in(c), lanes.build(c.terrain)
+    _check_lanes(c, atlas)
+    return World(c, physics, atlas, _settle_robots(c, physics))
+
+
+def _check_lanes(c: Config, atlas: Atlas) -> None:
+    """Refuse kinds of lanes that there are none of, and starts beyond a lane's goal."""
+    known = [*KINDS, *atlas.kinds]
+    for kind in c.command.open_kinds:
+        if kind not in known:
+            raise ConfigError(f"--command.open-kinds: {describe_unknown('kind', kind, known)}")
+    goal = float(atlas.end) - c.episode.lane_end
+    if set(atlas.kinds) - set(c.command.open_kinds) and c.episode.start_x[1] >= goal:
+        raise ConfigError(
+            f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and its goal, "
+            f"--episode.lane-end before its end, is at {goal:g} m"
+        )
 
 
 def _settle_robots(c: Config, physics: Physics) -> Body:

@@ -39,6 +39,15 @@ def test_everything_comes_back(small, tmp_path):
     assert sources.read_config(path) == small.config and not sources.is_run(path)
 
 
+def test_a_policy_is_summarized_as_it_is_described(small, tmp_path):
+    policy = learned(small, tmp_path / "learned.npz")
+    learner_file.write(policy, policy.run)
+    assert sources.summarize(policy.run) == sources.describe(policy.run, policy)
+    bundled = sources.bundled_policy()
+    expected = f"{bundled}: network full, trained on mixed for 86.0 M samples"
+    assert sources.summarize(bundled) == expected
+
+
 def test_another_network_is_refused(small, tmp_path):
     path = tmp_path / "learned.npz"
     learner_file.write(learned(small, path), path)

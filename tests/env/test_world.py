@@ -1,0 +1,28 @@
+"""What an environment cannot be made of is said before a robot is simulated."""
+
+import pytest
+import small_world
+
+from cref_jax import config
+from cref_jax.env.world import make_world
+from cref_jax.errors import ConfigError
+
+GAP = {"name": "gap", "levels": 2}
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (
+            {"command": {"open_kinds": ["flatt"]}},
+            "--command.open-kinds: unknown kind 'flatt'; did you mean 'flat'",
+        ),
+        # lanes of 12 m, won 1 m before their end
+        ({"episode": {"start_x": [0.5, 11.0]}, "terrain": GAP}, "up to 11 m .* is at 11 m"),
+        ({"episode": {"lane_end": 11.5}, "terrain": GAP}, "up to 1 m .* is at 0.5 m"),
+    ],
+)
+def test_lanes_and_starts_that_do_not_go_together_are_refused(world, changes, says):
+    c = config.override(small_world.C, changes)
+    with pytest.raises(ConfigError, match=says):
+        make_world(c, world.physics)
