@@ -1,6 +1,7 @@
 """Shared by the commands: their options, one-line errors and checks of output files."""
 
 import contextlib
+import itertools
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -39,11 +40,26 @@ def parse(options: type[R], arguments: Sequence[str] | None, command: str) -> R:
     """Parse the options of a command, and check their numbers.
 
     Raises:
-        ConfigError: a number is out of the range that its field is annotated with.
+        ConfigError: a number is out of the range that its field is annotated with, or an argument
+            is empty.
     """
+    check_arguments(sys.argv[1:] if arguments is None else arguments)
     parsed = tyro.cli(options, args=arguments, prog=f"python -m cref_jax.{command}")
     check_ranges(parsed, declared_ranges(options))
     return parsed
+
+
+def check_arguments(arguments: Sequence[str]) -> None:
+    """Refuse empty values: as a path they would be the current folder, as a name no name.
+
+    Raises:
+        ConfigError: names the option.
+    """
+    for before, argument in itertools.pairwise(["", *arguments]):
+        is_empty_option = argument.startswith("--") and argument.endswith("=")
+        if not argument or is_empty_option:
+            option = argument.removesuffix("=") or before or "an argument"
+            raise ConfigError(f"{option} is empty; is a shell variable not set?")
 
 
 @contextlib.contextmanager

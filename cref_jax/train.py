@@ -34,6 +34,7 @@ from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
 from cref_jax.training.trainer import Programs
 
+PROGRAM = "python -m cref_jax.train"
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
 NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings
 
@@ -97,6 +98,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     given, arguments = arguments, sys.argv[1:] if arguments is None else arguments
     with processes.ending_together(), cli.one_line_errors(given):
+        cli.check_arguments(arguments)
         asked = _options(arguments)
         jax_setup.prepare([asked.engine])
         others = asked.coordinator, asked.num_processes, asked.process_id
@@ -129,7 +131,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     else:
         base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
-    command = tyro.cli(Command, args=arguments, default=default, prog="python -m cref_jax.train")
+    command = tyro.cli(Command, args=arguments, default=default, prog=PROGRAM)
     init = command.options.init and sources.find_policy(command.options.init)
     options = dataclasses.replace(command.options, device=options.device, init=init)
     c = _with_short_options(command.settings, options)
@@ -144,7 +146,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
 def _options(arguments: list[str]) -> Options:
     """Parse the options alone, since they decide the defaults of the settings."""
     asked = [a for a in arguments if a not in ("-h", "--help")]
-    options, _ = tyro.cli(Options, args=asked, return_unknown_args=True)
+    options, _ = tyro.cli(Options, args=asked, prog=PROGRAM, return_unknown_args=True)
     return options
 
 

@@ -100,6 +100,22 @@ def test_a_number_out_of_its_range_is_one_line(capsys, command, arguments, says)
 
 
 @pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["--seed", "1", "--run", ""], "--run"),
+        (["--run=", "--seed", "1"], "--run"),
+        ([""], "an argument"),
+    ],
+)
+def test_an_empty_value_is_a_shell_variable_that_is_not_set(capsys, arguments, option):
+    for command in ("eval", "train"):
+        with pytest.raises(SystemExit) as end:
+            importlib.import_module(f"cref_jax.{command}").main(arguments)
+        said = f"error: {option} is empty; is a shell variable not set?\n"
+        assert end.value.code == 2 and capsys.readouterr().err == said
+
+
+@pytest.mark.parametrize(
     ("command", "option", "name"),
     [
         ("eval", "--out", "results"),

@@ -5,7 +5,6 @@ A checkpoint with thousands of robots takes hundreds of megabytes; the learner t
 
 import dataclasses
 import json
-import zipfile
 from pathlib import Path
 
 import jax
@@ -48,7 +47,12 @@ def read_config(path: Path) -> Config:
     Raises:
         ConfigError: it is not a learner file, or from another version of the program.
     """
-    return presets.apply_table(Config(), json.loads(str(_load_arrays(path)[_SETTINGS])), path)
+    text = str(_load_arrays(path)[_SETTINGS])
+    try:
+        settings = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+    return presets.apply_table(Config(), settings, path)
 
 
 def read_iteration(path: Path) -> int:
@@ -79,7 +83,7 @@ def _load_arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path) as file:
             arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # numpy raises many kinds for a damaged file
         raise ConfigError(f"cannot read {path}: {error}") from None
     if missing := {_SETTINGS, _ITERATION} - arrays.keys():
         raise ConfigError(f"{path} was not written by export --learner: no {sorted(missing)[0]}")

@@ -64,8 +64,8 @@ def _read_array(path: Path) -> Values:
         heights = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
         raise ConfigError(f"no file {path}") from None
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}") from None
+    except Exception as error:  # numpy raises many kinds for a damaged header
+        raise _unreadable(path, error) from None
     if heights.ndim != 2 or 0 in heights.shape or heights.dtype.kind not in "fiu":
         raise ConfigError(f"{path} must hold numbers [X, Y], not {heights.dtype}{heights.shape}")
     atlas.check_columns(heights.shape, str(path))
@@ -82,10 +82,15 @@ def _read_picture(path: Path) -> tuple[Values, float | None]:
             return np.asarray(image)[::-1].T.astype(np.float64), _read_number(tag)
     except FileNotFoundError:
         raise ConfigError(f"no file {path}") from None
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path}: {error}") from None
+    except ConfigError:
+        raise
+    except Exception as error:  # Pillow raises many kinds for a damaged file
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: Exception) -> ConfigError:
+    """Say in one line why a file cannot be read."""
+    return ConfigError(f"{path}: {' '.join(str(error).split()) or type(error).__name__}")
 
 
 def _check_pixels(path: Path, image: Image.Image) -> None:

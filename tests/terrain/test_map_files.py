@@ -60,6 +60,31 @@ def test_heights_that_are_no_ground_are_refused(tmp_path):
     assert heights(tmp_path / "hill.npy", SETTINGS.replace("0.01", "0.001")).max() == 12.0
 
 
+@pytest.mark.filterwarnings("ignore")  # of numpy and Pillow
+@pytest.mark.parametrize("name", ["hill.npy", "hill.png", "hill.tif"])
+def test_a_damaged_map_is_refused_in_one_line_or_is_still_ground(tmp_path, name):
+    path, rng = tmp_path / name, np.random.default_rng(5)
+    if name == "hill.npy":
+        np.save(path, HEIGHTS)
+    else:
+        Image.fromarray(HEIGHTS.astype(np.uint16)).save(path)
+    whole, refused = path.read_bytes(), 0
+    for cut in [b"", *(whole[:n] for n in (1, 5, 12, 40))]:
+        path.write_bytes(cut)
+        refusal(path)
+    for _ in range(500):
+        damaged = bytearray(whole)
+        for place in rng.integers(len(whole), size=2):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            assert np.isfinite(map_files.read_values(path)).all()
+        except ConfigError as error:
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 50
+
+
 @pytest.mark.parametrize("bits", [1, 2, 4])
 def test_grey_of_few_bits_would_be_stretched(tmp_path, bits):
     image = Image.fromarray(np.zeros((4, 4), np.uint8)).convert("1" if bits == 1 else "L")
