@@ -1,6 +1,7 @@
 """Shared by the commands: their options, one-line errors and checks of output files."""
 
 import contextlib
+import io
 import itertools
 import os
 import sys
@@ -70,6 +71,8 @@ def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
     a script that has called the command with `arguments` goes on after Ctrl-C.
     """
     is_program = arguments is None
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a terminal of few characters loses no result
     try:
         with _flushed():
             yield
@@ -104,9 +107,11 @@ def _flushed() -> Iterator[None]:
 
 def _one_line(error: Exception) -> str:
     """Return what an error says; what the system refuses comes with the file that it is about."""
-    if not isinstance(error, OSError) or error.strerror is None:
-        return str(error)
-    return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    message = str(error)
+    if isinstance(error, OSError) and error.strerror is not None:
+        file = f"{error.filename}: " if error.filename else ""
+        message = f"{file}{error.strerror}"
+    return " ".join(message.splitlines())  # a name may have any characters
 
 
 def prepare_output(out: Path, suffix: str, option: str = "--out") -> Path:

@@ -1,6 +1,7 @@
 """What all commands share: errors of one line, and files that can be written."""
 
 import importlib
+import os
 import subprocess
 import sys
 import typing
@@ -33,12 +34,23 @@ def test_ctrl_c_leaves_a_program_that_calls_a_command_alive():
     [
         (PermissionError(13, "Permission denied", "runs/a"), "runs/a: Permission denied"),
         (OSError(28, "No space left on device"), "No space left on device"),
+        (ConfigError("no file a\nb"), "no file a b"),
     ],
 )
 def test_what_the_system_refuses_is_one_line_with_the_file(capsys, error, says):
     with pytest.raises(SystemExit) as end, cli.one_line_errors([]):
         raise error
     assert end.value.code == 2 and capsys.readouterr().err == f"error: {says}\n"
+
+
+def test_a_terminal_of_few_characters_loses_no_result():
+    program = "from cref_jax import cli\nwith cli.one_line_errors(): print('runs/Tür: 3 m')"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert (done.returncode, done.stdout) == (0, b"runs/T?r: 3 m\n")
 
 
 @pytest.mark.parametrize("ends", ["pass", "sys.exit(0)"])  # as after --help

@@ -27,7 +27,7 @@ def lock(directory: str | os.PathLike[str]) -> Iterator[None]:
     path = Path(directory).absolute() / "run.lock"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+", encoding="utf-8")
+        file = path.open("a+", encoding="utf-8", errors="replace")
     except OSError as error:
         raise CheckpointError(f"{path.parent}: cannot be written: {error.strerror}") from error
     with file:

@@ -448,3 +448,9 @@ def test_equal_digests_mean_equal_bits():
         {"a": tree["a"], "c": tree["b"]},
     ]
     assert pytree_digest.digest(tree) not in {pytree_digest.digest(other) for other in others}
+
+
+def test_a_lock_of_any_bytes_is_read(tmp_path):
+    (tmp_path / "run.lock").write_bytes(b"\xff\xfe\x00")
+    with run_lock.lock(tmp_path):
+        assert (tmp_path / "run.lock").read_text().startswith(f"{os.getpid()} ")
