@@ -76,11 +76,8 @@ def describe_unused(own: Config, experiment: str) -> list[str]:
 def _find_differences(own: Any, other: Any, where: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yield the dotted name and both values of each setting that differs."""
     for field in dataclasses.fields(own):
-        name, old, new = (
-            f"{where}{field.name}",
-            getattr(own, field.name),
-            getattr(other, field.name),
-        )
+        name = f"{where}{field.name}"
+        old, new = getattr(own, field.name), getattr(other, field.name)
         if dataclasses.is_dataclass(old):
             yield from _find_differences(old, new, f"{name}.")
         elif old != new:
