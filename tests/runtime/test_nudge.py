@@ -67,6 +67,8 @@ def swing(legs, sense=same, gyro=same, act=same, noise=0.0, seed=0, sinks=0.0, m
     for k in range(10):
         q, w = robot.answer(moves * act(target))
         q[[HIP_PITCH, 6 + HIP_PITCH]] += sinks * k, -sinks * k
+        q[[ANKLE_PITCH, 6 + ANKLE_PITCH]] += 0.01 * k  # the base tips back as the held knees yield
+        w[1] = -0.01 / PERIOD
         q, w = sense(q), gyro(w)
         q, w = (x + noise * rng.uniform(-1, 1, x.shape) * s for x, s in ((q, 0.02), (w, 0.2)))
         nudge.add(q.astype(np.float32), w.astype(np.float32))
@@ -99,6 +101,8 @@ def test_a_robot_that_is_right_is_found_right(legs):
     ("wrong", "flag", "words"),
     [
         ({"gyro": lambda w: w * [1, 1, -1]}, Status.GYRO_WRONG, "angular_velocity's z"),
+        ({"gyro": lambda w: w[[1, 0, 2]] * [-1, 1, 1]}, Status.IMU_TURNED, "about the IMU's x"),
+        ({"gyro": lambda w: w[[1, 0, 2]] * [1, -1, 1]}, Status.IMU_TURNED, "about the IMU's x"),
         ({"sense": flip(HIP_ROLL)}, Status.JOINTS_MIXED_UP, "left_hip_roll_joint or left_ankle"),
         (
             {"sense": flip(6 + ANKLE_ROLL)},
