@@ -1,4 +1,4 @@
-"""Watch a robot walk: `python -m cref_jax.play --run runs/NAME`.
+"""Watch a robot walk: `python -m cref_jax.play --run runs/NAME`, or drive it with `--live`.
 
 Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
 """
@@ -27,10 +27,13 @@ from cref_jax.env import footholds
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import protocol
+from cref_jax.live import server
+from cref_jax.live.server import Settings
+from cref_jax.live.stage import Place
 from cref_jax.policy import sources
 from cref_jax.rendering import policy_overlay, robot_scene, video
 from cref_jax.system import jax_setup
-from cref_jax.terrain import lanes
+from cref_jax.terrain import lanes, map_files
 from cref_jax.terrain.atlas import Atlas
 from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import rollout
@@ -42,6 +45,7 @@ Level = int | Literal["easy", "medium", "hard", "ood"]
 FRAME_RATE = 25.0  # 1/s
 WIDTH, HEIGHT = 960, 540  # pixels of the video
 STILL_WIDTH = 480  # pixels of one still; its height is HEIGHT
+SPEED = 0.6  # m/s forward; assumed: the middle of Sec. III-A
 
 ENDINGS = {  # of an episode, by its name in state.Ending
     "tilted": "fell, tilted too far",
@@ -71,8 +75,8 @@ class Options(cli.PolicyOptions):
     """kind of lane, such as stairs_down (default: the terrain's first)"""
     level: Level | None = None
     """0 (easiest) to 9, or the name of a size of Table II (default: the middle one)"""
-    command: Annotated[float, Within(-10, 10)] = 0.6
-    """m/s forward"""
+    command: Annotated[float | None, Within(-10, 10)] = None
+    """m/s forward (default: 0.6; with --live that of a trial of `sim2sim`, drawn from --seed)"""
     seconds: Annotated[float, Within(0.02, 600)] = 10.0
     """length of the film; it ends earlier where the robot falls or the lane ends"""
     seed: Annotated[int, limits.SEED] = 0
@@ -81,6 +85,14 @@ class Options(cli.PolicyOptions):
     """write N stills side by side instead of a video"""
     out: Path | None = None
     """.mp4, or .png for stills (default: play.mp4 in the run's folder)"""
+    live: bool = False
+    """instead of a film, a page in the browser on which to drive the whole robot"""
+    scene: str | None = None
+    """with --live: a scene of `eval --suite ood`, such as curbs, instead of a lane"""
+    host: str = "127.0.0.1"
+    """address that the page listens on; the default is this machine alone"""
+    port: int = 8080
+    """port of the page; if it is taken, the next free one"""
 
 
 class Recording(NamedTuple):
@@ -119,13 +131,13 @@ def main(arguments: list[str] | None = None) -> None:
     with cli.one_line_errors(arguments):
         options = cli.parse(Options, arguments, "play")
         jax_setup.prepare()
-        play(options)
+        if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
+            jax.config.update("jax_platforms", "cpu")
+        (drive if options.live else play)(options)
 
 
 def play(options: Options) -> None:
     """Simulate, film and summarise one episode."""
-    if not jax.config.jax_platforms:  # one robot needs no GPU, and leaves it to training
-        jax.config.update("jax_platforms", "cpu")
     is_trained = options.agent == "trained"
     source = sources.resolve_policy(options.run, options.policy) if is_trained else options.run
     c = sources.read_config(source) if source else Config()
@@ -151,7 +163,27 @@ def play(options: Options) -> None:
             moments = np.arange(0, len(recording.qpos), stride)
             video.write_video(out, _film(canvas, recording, moments, c), 1.0 / (stride * period))
     print(f"wrote {out}")
-    print(summary(recording, options.command, period))
+    print(summary(recording, _speed(options), period))
+
+
+def drive(options: Options) -> None:
+    """Serve the page on which people drive the robot, until Ctrl-C."""
+    _check_options(options)
+    if options.agent != "trained" or options.stills or options.out:
+        raise ConfigError("--live goes without --agent, --stills and --out")
+    source = sources.resolve_policy(options.run, options.policy)
+    c = sources.read_config(source)
+    terrain = options.terrain or c.terrain.name
+    if options.scene:
+        place = Place(scene=options.scene)
+    elif map_files.is_map(terrain):
+        place = Place(map=Path(terrain))
+    else:
+        atlas = _build_lane(dataclasses.replace(c.terrain, name=terrain), options)
+        kind = options.kind or atlas.kinds[0]
+        place = Place(kind, float(atlas.sizes[0, atlas.kinds.index(kind)]))
+    settings = Settings(source, place, options.seed, options.command, options.host, options.port)
+    server.serve(settings)
 
 
 def record(world: World, train: ppo.TrainState | None, options: Options) -> Recording:
@@ -229,6 +261,11 @@ def _view_policy(c: config.Network, robots: rollout.Robots, policy: network.Outp
     )
 
 
+def _speed(options: Options) -> float:
+    """Return the speed asked for, m/s."""
+    return SPEED if options.command is None else options.command
+
+
 def _build_world(options: Options, c: Config) -> World:
     """Build a world of one lane, with evaluation settings."""
     c = dataclasses.replace(
@@ -236,9 +273,8 @@ def _build_world(options: Options, c: Config) -> World:
     )
     atlas = _build_lane(c.terrain, options)
     c = protocol.evaluation_config(c, seconds=options.seconds + 1.0)  # it does not end by itself
-    c = dataclasses.replace(
-        c, command=dataclasses.replace(c.command, lane_vx=(options.command, options.command))
-    )
+    speed = _speed(options)
+    c = dataclasses.replace(c, command=dataclasses.replace(c.command, lane_vx=(speed, speed)))
     return build_world(c, "mujoco").replace(lanes=atlas)
 
 

@@ -22,6 +22,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, protocol, sim2sim_table
 from cref_jax.evaluation.crossing import LaneResult
 from cref_jax.evaluation.protocol import TRIAL_SECONDS
+from cref_jax.evaluation.whole_robot import initial_states, to_lane
 from cref_jax.physics.simulation import Physics
 from cref_jax.policy import reader, sources
 from cref_jax.policy.trained import TrainedPolicy
@@ -167,21 +168,6 @@ class _Walker:
             body = body.deviate(sample_deviation(self._config, len(body.driven), rng))
             perturbation = Perturbation(self._config, rng)
         return run_trial(body, policy, start, TRIAL_SECONDS, self._disturbance, perturbation)
-
-
-def to_lane(world: World, level: int = 0) -> Lane:
-    """Convert a lane of a world with one kind."""
-    ground = world.lanes.tile(level, 0)
-    heights, origin = robot_scene.window(ground)
-    return Lane(heights, origin, ground.cell, world.lanes.end - world.config.episode.lane_end)
-
-
-def initial_states(world: World, seed: int, count: int) -> list[Start]:
-    """Compute the initial poses and commands of the trials of this seed."""
-    state = crossing.first_robots(world, seed, count).env
-    qpos, speeds = np.asarray(state.body.qpos), np.asarray(state.command[:, 0])
-    driven = slice(7, 7 + world.physics.robot.num_joints)
-    return [Start(x[:7], x[driven], float(v)) for x, v in zip(qpos, speeds, strict=True)]
 
 
 def summarize(trials: list[Trial], options: Options) -> LaneResult:

@@ -37,18 +37,19 @@ def draw(view: PolicyView, height: int, d_max: float, period: float, sees: bool)
     if sees:
         pen.text((MARGIN, top), f"depth, 0 to {d_max:g} m (near is red)", INK, font)
         size = (inner, inner * 3 // 4)
-        picture.paste(_depth_image(view.depth, size), (MARGIN, top + TITLE))
+        picture.paste(colour_depth(view.depth, size), (MARGIN, top + TITLE))
         top += TITLE + size[1] + MARGIN
         pen.text((MARGIN, top), "attention, mean over heads", INK, font)
         size = (inner // 2, inner * 3 // 8)
         picture.paste(_attention_image(view.attention, size), (MARGIN, top + TITLE))
         top += TITLE + size[1] + MARGIN
     pen.text((MARGIN, top), "highway gate (1: memory)", INK, font)
-    _draw_gate(pen, view.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
+    draw_gate(pen, view.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
     return np.asarray(picture)
 
 
-def _depth_image(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
+def colour_depth(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
+    """Draw a depth image, normalised, `size` pixels wide and high; grey where there is none."""
     if depth is None:
         return Image.new("RGB", size, FAINT)
     colours = matplotlib.colormaps[DEPTHS](np.clip(depth + 0.5, 0.0, 1.0), bytes=True)
@@ -65,7 +66,7 @@ def _attention_image(weights: Float[np.ndarray, " N"] | None, size: tuple[int, i
     return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
 
 
-def _draw_gate(
+def draw_gate(
     pen: ImageDraw.ImageDraw,
     gates: Float[np.ndarray, "t D"],
     box: tuple[int, int, int, int],

@@ -1,4 +1,4 @@
-"""One trial of a policy on the whole robot."""
+"""One trial of a policy on the whole robot, and the steps it is made of."""
 
 import math
 from typing import NamedTuple
@@ -35,6 +35,68 @@ class Trial(NamedTuple):
     qpos: Float[np.ndarray, "T Q"]  # before each control step
 
 
+class Episode:
+    """A policy driving the whole robot, control step by control step."""
+
+    def __init__(
+        self,
+        body: WholeBodySim,
+        policy: Policy,
+        start: Start,
+        disturbance: Disturbance = UNDISTURBED,
+        perturbation: Perturbation | None = None,
+    ) -> None:
+        """Place the robot and reset the policy.
+
+        Args:
+            body: the model.
+            policy: as loaded by deploy.py.
+            start: initial pose and command.
+            disturbance: camera faults.
+            perturbation: sensor noise and pushes.
+        """
+        self.body, self.policy, self.start = body, policy, start
+        self.state = _initial_state(body, start)
+        self.steps = 0  # done
+        self.status = Status.OK  # union of the policy's status over all steps and frames
+        self.command = np.array([start.speed, 0.0, 0.0])  # of the last step
+        self.speed = 0.0  # m/s forward in the body frame
+        self.force = np.zeros((2, 3))  # N, of the ground on each foot, mean over the last step
+        self.frame: Float[np.ndarray, "H W"] | None = None  # m, the newest that was delivered
+        self._latency, self._perturbation = disturbance.latency, perturbation
+        self._checker = TerminationChecker(body, self.state, start.speed)
+        self._channel = Channel(disturbance)
+        self._before = body.robot.nominal_pose[body.driven]
+        policy.reset()
+
+    def step(self, command: Float[np.ndarray, "3"] | None = None) -> str | None:
+        """Advance one control step; return the first reason to end, or None.
+
+        Without a command, an operator keeps the robot in the middle of its lane at the start's
+        speed.
+        """
+        body, policy, state, t = self.body, self.policy, self.state, self.steps
+        c, now = body.config, t * body.config.physics.control_period
+        if delivered := self._channel.receive(t):
+            self.frame = delivered[0]
+            self.status |= policy.on_depth(*delivered)
+        rotation = state.xmat[body.robot.pelvis].reshape(3, 3)
+        if command is None:
+            command = lane_command(c.command, self.start.speed, state.qpos)
+        if self._perturbation:
+            self._perturbation.push(state, body.robot.mass, body.hands)
+        gyro, gravity, q, qd = _sense(body, state, self._perturbation)
+        target = policy.step(gyro, gravity, command, q, qd, now)
+        self.status |= policy.status
+        due = not policy.blind and _is_due(t + self._latency, c)
+        if due and not self._channel.loses_one():
+            self._channel.send(body.image(state), t, now)
+        self.force = body.advance(state, (self._before, target))
+        self._before, self.command, self.steps = target, command, t + 1
+        self.speed = float(rotation[:, 0] @ state.qvel[:3])
+        return self._checker.check(state, self.force)
+
+
 def run_trial(
     body: WholeBodySim,
     policy: Policy,
@@ -43,46 +105,22 @@ def run_trial(
     disturbance: Disturbance = UNDISTURBED,
     perturbation: Perturbation | None = None,
 ) -> Trial:
-    """Run one trial until the robot falls, finishes, strays or stalls, or time is up.
-
-    Args:
-        body: the model.
-        policy: as loaded by deploy.py; it is reset first.
-        start: initial pose and command.
-        seconds: time limit.
-        disturbance: camera faults.
-        perturbation: sensor noise and pushes.
-    """
-    c, period, latency = body.config, body.config.physics.control_period, disturbance.latency
-    state = _initial_state(body, start)
-    checker, channel = TerminationChecker(body, state, start.speed), Channel(disturbance)
-    ending, status, path, speeds = None, Status.OK, [], []
-    before = body.robot.nominal_pose[body.driven]
-    policy.reset()
-    for t in range(round(seconds / period)):
-        path.append(state.qpos.copy())
-        if delivered := channel.receive(t):
-            status |= policy.on_depth(*delivered)
-        rotation = state.xmat[body.robot.pelvis].reshape(3, 3)
-        command = lane_command(c.command, start.speed, state.qpos)
-        if perturbation:
-            perturbation.push(state, body.robot.mass, body.hands)
-        gyro, gravity, q, qd = _sense(body, state, perturbation)
-        target = policy.step(gyro, gravity, command, q, qd, t * period)
-        status |= policy.status
-        if not policy.blind and _is_due(t + latency, c) and not channel.loses_one():
-            channel.send(body.image(state), t, t * period)
-        force = body.advance(state, (before, target))
-        before = target
-        speeds.append(float(rotation[:, 0] @ state.qvel[:3]))
-        if ending := checker.check(state, force):
+    """Run one episode until the robot falls, finishes, strays or stalls, or `seconds` are over."""
+    episode = Episode(body, policy, start, disturbance, perturbation)
+    ending, path, speeds = None, [], []
+    period = body.config.physics.control_period
+    for _ in range(round(seconds / period)):
+        path.append(episode.state.qpos.copy())
+        ending = episode.step()
+        speeds.append(episode.speed)
+        if ending:
             break
     return Trial(
         ending=ending or "late",
         seconds=len(path) * period,
-        progress=float(state.qpos[0] - start.base[0]),
+        progress=float(episode.state.qpos[0] - start.base[0]),
         speed=float(np.mean(speeds)),
-        status=status,
+        status=episode.status,
         qpos=np.stack(path),
     )
 

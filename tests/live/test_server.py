@@ -1,0 +1,90 @@
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from cref_jax.errors import ConfigError
+from cref_jax.live import server
+from cref_jax.live.server import Settings
+from cref_jax.live.stage import Place
+
+CURBS = Settings(Path("robust"), Place(scene="curbs"))
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def page():
+    port = free_port()
+    page = server.open_page(CURBS, port)
+    thread = threading.Thread(target=page.run)
+    thread.start()
+    yield page, port
+    page.stop()
+    thread.join()
+    page.close()
+
+
+def test_the_page_answers_on_this_machine(page):
+    with urllib.request.urlopen(f"http://127.0.0.1:{page[1]}/", timeout=30) as answer:
+        assert answer.status == 200
+        assert b"<!doctype html>" in answer.read(200)
+
+
+def test_it_is_not_to_be_reached_from_elsewhere(page):
+    """127.0.0.2 is this machine, too, but not the address that is listened on."""
+    with pytest.raises(OSError), socket.create_connection(("127.0.0.2", page[1]), timeout=5):
+        pass
+
+
+def test_a_taken_port_gives_the_next_free_one():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < server.find_port("127.0.0.1", port) < port + server.PORTS
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "message"),
+    [
+        ("127.0.0.1", 0, "--port must be 1 to 65535, not 0"),
+        ("203.0.113.1", 8080, "--host 203.0.113.1: "),
+        ("no such host", 8080, "--host no such host: "),
+    ],
+)
+def test_an_address_that_cannot_be_used_is_one_line(host, port, message):
+    with pytest.raises(ConfigError, match=message):
+        server.find_port(host, port)
+
+
+def test_it_says_how_to_reach_it_from_another_machine(monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "box")
+    said = server.describe_address("127.0.0.1", 8081)
+    assert "http://127.0.0.1:8081" in said
+    assert "ssh -L 8081:127.0.0.1:8081 box" in said
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_it_quietly():
+    words = f"-m cref_jax.play --live --policy robust --scene curbs --port {free_port()}"
+    command = [sys.executable, *words.split()]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as live:
+        assert live.stdout
+        assert live.stdout.readline().startswith("open http://127.0.0.1:")
+        live.send_signal(signal.SIGINT)
+        said, complaints = live.communicate(timeout=60)
+    assert live.returncode == 130
+    assert complaints.split() == ["interrupted"]
+    assert "Traceback" not in said
