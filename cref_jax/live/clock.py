@@ -17,6 +17,7 @@ class Clock:
     def __init__(self, session: Session) -> None:
         self.speed, self.paused = 1.0, False
         self._session, self._over = session, threading.Event()
+        self._lock = threading.Lock()
         self._done: collections.deque[float] = collections.deque()  # s, wall time of each step
         self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
         self.failure: Exception | None = None  # that ended the stepping
@@ -39,7 +40,8 @@ class Clock:
     def share(self) -> float:
         """Simulated time per wall time, over the last `MEASURED` seconds."""
         now = time.perf_counter()
-        recent = [at for at in self._done if at > now - MEASURED]
+        with self._lock:
+            recent = [at for at in self._done if at > now - MEASURED]
         if len(recent) < 2:
             return 0.0
         return (len(recent) - 1) * self._session.period / (now - recent[0])
@@ -48,7 +50,8 @@ class Clock:
         due = time.perf_counter()
         while not self._over.is_set():
             if self.paused:
-                self._done.clear()
+                with self._lock:
+                    self._done.clear()
                 self._over.wait(0.02)
                 due = time.perf_counter()
                 continue
@@ -58,8 +61,9 @@ class Clock:
                 self.failure, self.paused = error, True
                 continue
             now = time.perf_counter()
-            self._done.append(now)
-            while self._done[0] < now - MEASURED:
-                self._done.popleft()
+            with self._lock:
+                self._done.append(now)
+                while self._done[0] < now - MEASURED:
+                    self._done.popleft()
             due = max(due, now - BEHIND) + self._session.period / self.speed
             self._over.wait(max(0.0, due - now))

@@ -9,26 +9,27 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 import viser
-from jaxtyping import Float
-from mjviser.conversions import merge_geoms
+from jaxtyping import UInt8
 
 from cref_jax import robot
-from cref_jax.live import ground_mesh
+from cref_jax.live import ground_mesh, robot_mesh
 from cref_jax.live.feet import SHOWN
 from cref_jax.live.foothold_search import FootholdSearch
+from cref_jax.live.matte import make_matte
 from cref_jax.live.session import View
 from cref_jax.live.stage import Stage
 from cref_jax.rendering.robot_scene import MARKS
 
-SHOWN_GROUP = 2  # geoms of the robot that are to be seen
 FOLLOW = 0.4  # s, in which the camera catches up with the robot
-CALM = 1.5  # s, the same upwards
+CALM = 0.6  # s, the same upwards
 LOOK_UP = 0.05  # m, from the pelvis to the middle of the picture
 DISC = 0.035  # m, radius of a touchdown's mark
 DOT = 0.02  # m, size of a candidate's mark
 ABOVE = np.array([0.0, 0.0, 0.006])  # m, marks above the ground
 AWAY = np.array([0.0, 0.0, -1000.0])  # m, where marks without a place are
 SKY = (226, 232, 239)
+SHADOW = 0.35  # darkness of shadows on the ground
+GAMMA = 2.2  # of a lit surface's colour, which is linear
 
 
 class _Body(NamedTuple):
@@ -75,8 +76,10 @@ class Drawing:
 
     def _set_stage(self, stage: Stage) -> None:
         """Replace ground and robot."""
-        mesh = ground_mesh.build_mesh(stage.ground)
-        self._scene.add_mesh_trimesh("/world/ground", mesh, cast_shadow=False)
+        mesh = make_matte(ground_mesh.build_mesh(stage.ground))
+        self._scene.add_mesh_trimesh(
+            "/world/ground", mesh, cast_shadow=False, receive_shadow=SHADOW
+        )
         self._search = FootholdSearch.on(stage)
         self._dots.points = np.tile(AWAY, (2, 1)).astype(np.float32)
         if self._stage is None or self._stage.policy.config.robot != stage.policy.config.robot:
@@ -105,26 +108,19 @@ class Drawing:
             return
         self._marked = newest
         places, colours = np.tile(AWAY, (SHOWN, 1)), np.zeros((SHOWN, 3), np.uint8)
+        lit = np.round(255.0 * (_colours() / 255.0) ** GAMMA)
         for i, (foot, at) in enumerate(view.touchdowns):
-            places[i], colours[i] = at + ABOVE, _colours()[foot]
+            places[i], colours[i] = at + ABOVE, lit[foot]
         self._discs.batched_positions = places.astype(np.float32)
         self._discs.batched_colors = colours
 
     def _add_robot(self, stage: Stage) -> list[_Body]:
         c = stage.body.config
         model = robot.spec("all", c.physics, 0, visual=True, name=c.robot.name).compile()
-        bodies = []
-        for number in range(1, model.nbody):
-            shown = [
-                i
-                for i in range(model.ngeom)
-                if model.geom_bodyid[i] == number and model.geom_group[i] == SHOWN_GROUP
-            ]
-            if shown:
-                name = f"/world/robot/{number}"
-                handle = self._scene.add_mesh_trimesh(name, merge_geoms(model, shown))
-                bodies.append(_Body(handle, number))
-        return bodies
+        return [
+            _Body(self._scene.add_mesh_trimesh(f"/world/robot/{body}", make_matte(mesh)), body)
+            for body, mesh in robot_mesh.build_links(model).items()
+        ]
 
     def _add_discs(self) -> viser.BatchedMeshHandle:
         disc = trimesh.creation.cylinder(DISC, 0.004, sections=24)
@@ -141,17 +137,13 @@ class Drawing:
         camera.fov = np.deg2rad(45.0)
         self._scene.set_background_image(np.tile(np.uint8(SKY), (2, 2, 1)))
         self._scene.configure_fog(9.0, 26.0, color=SKY)
-        self._scene.configure_default_lights(False)
-        self._scene.configure_environment_map(None)
-        self._scene.add_light_hemisphere(
-            "/light/sky", sky_color=(255, 255, 255), ground_color=(170, 165, 160), intensity=2.4
-        )
+        self._scene.configure_default_lights(False)  # several maps of shadows: slow without a GPU
+        self._scene.add_light_ambient("/light/sky", intensity=1.5)
         self._scene.add_light_directional(
-            "/light/sun", color=(255, 250, 240), intensity=2.6, cast_shadow=True,
-            position=(-1.5, -2.5, 4.0),
-        )  # fmt: skip
+            "/light/sun", intensity=2.2, cast_shadow=True, position=(-1.5, -2.5, 4.0)
+        )
 
 
-def _colours() -> Float[np.ndarray, "2 3"]:
+def _colours() -> UInt8[np.ndarray, "2 3"]:
     """Return the colours of the left and the right foot, 0 to 255."""
     return np.round(255.0 * np.array(MARKS)[:, :3]).astype(np.uint8)

@@ -100,7 +100,9 @@ class DrivePanel:
         pause = lambda paused: lambda: setattr(self._clock, "paused", paused)
         acts = {"Pause": pause(True), "Go on": pause(False), "Step": self._clock.step_once}
         self._add_buttons("Clock", "a step is one of control, 20 ms", acts)
-        self._restarts = self._gui.add_checkbox("Begin again after a fall", True)
+        self._restarts = self._gui.add_checkbox(
+            "Begin again", True, hint="two seconds after a fall or the end"
+        )
         self._speed.on_update(lambda _: setattr(self._clock, "speed", self._speed.value))
         self._restarts.on_update(lambda _: setattr(self._session, "restarts", self._restarts.value))
 

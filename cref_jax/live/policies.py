@@ -7,7 +7,7 @@ import numpy as np
 
 from cref_jax import deploy, robot
 from cref_jax.config import Config, folders
-from cref_jax.env.world import build_world
+from cref_jax.env.world import World, build_world
 from cref_jax.policy import learner_file, reader, sources
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
@@ -17,7 +17,8 @@ from cref_jax.training import pytree_digest
 class Loaded(NamedTuple):
     """A policy that was read from disk."""
 
-    name: str
+    name: str  # by which it is loaded again
+    detail: str  # which of a run's policies it is; nothing for an export
     config: Config  # that it was trained with
     manifest: dict[str, Any]
     arrays: dict[str, np.ndarray]
@@ -27,8 +28,10 @@ class Loaded(NamedTuple):
         return deploy.Policy(self.manifest, dict(self.arrays))
 
 
-def load(source: Path) -> Loaded:
+def load(source: Path, world: World | None = None) -> Loaded:
     """Load a bundled policy by name, an export, or the newest checkpoint of a run.
+
+    `world` spares a run the seconds in which one is built from its settings.
 
     Raises:
         ConfigError: it is none of these.
@@ -38,10 +41,10 @@ def load(source: Path) -> Loaded:
     is_bundled = path.parent == folders.data_folder("policies")
     name = path.name if is_bundled else str(source)
     if path.exists() and (sources.is_run(path) or learner_file.is_learner(path)):
-        world = build_world(sources.read_config(path), "mujoco")
+        world = world or build_world(sources.read_config(path), "mujoco")
         return from_training(name, sources.load(path, world))
     c = sources.read_config(path)
-    return Loaded(name, c, *reader.read_contents(path))
+    return Loaded(name, "", c, *reader.read_contents(path))
 
 
 def from_training(name: str, policy: TrainedPolicy) -> Loaded:
@@ -49,7 +52,8 @@ def from_training(name: str, policy: TrainedPolicy) -> Loaded:
     arrays = pytree_digest.on_host(policy.train.params.actor["params"])
     arrays = {key: np.asarray(array, np.float32) for key, array in arrays.items()}
     manifest = build_manifest(policy, robot.load(policy.config.robot))
-    return Loaded(name, policy.config, manifest, arrays)
+    detail = f"iteration {policy.iteration}"
+    return Loaded(name, detail, policy.config, manifest, arrays)
 
 
 def bundled_names() -> list[str]:

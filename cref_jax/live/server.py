@@ -13,6 +13,7 @@ from cref_jax.live import policies
 from cref_jax.live.page import Page
 from cref_jax.live.session import Session, Wish
 from cref_jax.live.stage import Place, StageBuilder
+from cref_jax.policy import sources
 
 PORTS = 20  # that are tried, from the one asked for
 
@@ -48,7 +49,8 @@ def open_page(settings: Settings, port: int) -> Page:
     session.drive(Wish(vx=settings.speed))
     with contextlib.redirect_stdout(io.StringIO()):  # it would print a table of its own
         server = viser.ViserServer(settings.host, port, label="cref_jax", verbose=False)
-    return Page(server, session, builder)
+    run = settings.policy if sources.is_run(sources.find_policy(settings.policy)) else None
+    return Page(server, session, builder, run)
 
 
 def find_port(host: str, port: int) -> int:

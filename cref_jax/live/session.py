@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from cref_jax.live.feet import Feet
 from cref_jax.live.film import RATE, Film, Moment
+from cref_jax.live.policies import Loaded
 from cref_jax.live.stage import Stage
 from cref_jax.whole_body.trial import Episode, lane_command
 
@@ -76,13 +77,23 @@ class Session:
         """Go to another stage, to its first start."""
         with self._lock:
             self._stage, self._policy, self._number = stage, stage.policy.runtime(), 0
+            self._next_policy: Loaded | None = None
             self._place_robot()
 
     def reset(self) -> None:
         """Place the robot at its next start."""
         with self._lock:
             self._number = (self._number + 1) % len(self._stage.starts)
+            if self._next_policy:
+                self._stage = self._stage._replace(policy=self._next_policy)
+                self._policy, self._next_policy = self._next_policy.runtime(), None
             self._place_robot()
+
+    def take_policy(self, policy: Loaded) -> None:
+        """Walk with a newer state of the same policy from the next start on."""
+        with self._lock:
+            if policy.name == self._stage.policy.name:
+                self._next_policy = policy
 
     def drive(self, wish: Wish) -> None:
         """Ask for speeds from now on."""

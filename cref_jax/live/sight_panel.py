@@ -20,14 +20,14 @@ class SightPanel:
     """A column with the depth image, the attention, the gate, and the robot's state in words."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._panel = server.gui.add_panel()
-        with self._panel.add_tab("What it sees", viser.Icon.EYE):
+        self.panel = server.gui.add_panel()
+        with self.panel.add_tab("What it sees", viser.Icon.EYE):
             self._words = server.gui.add_html("")
             blank = np.full((sight_picture.HEIGHT, sight_picture.WIDTH, 3), 255, np.uint8)
             self._picture = server.gui.add_image(blank, format="jpeg", jpeg_quality=QUALITY)
             self._said = ""
-        self._panel.dock_left()
-        self._panel.set_width(sight_picture.WIDTH + 24)
+        self.panel.dock_left()
+        self.panel.set_width(sight_picture.WIDTH + 24)
 
     def draw_picture(self, view: View) -> None:
         """Draw depth, attention and gate."""
@@ -36,13 +36,14 @@ class SightPanel:
     def write(self, view: View, clock: Clock) -> None:
         """Write speeds, time and status."""
         forward, left, turn = view.command
+        policy = view.stage.policy
         rows = {
             "On": view.stage.place.title(),
-            "Policy": view.stage.policy.name,
+            "Policy": ", ".join(filter(None, (policy.name, policy.detail))),
             "Forward": f"{view.velocity[0]:.2f} of {forward:.2f} m/s",
             "Left": f"{view.velocity[1]:.2f} of {left:.2f} m/s",
             "Turn": f"{view.yaw_rate:.2f} of {turn:.2f} rad/s",
-            "Time": f"{view.seconds:.1f} s, {_describe_pace(clock)}",
+            "Time": f"{view.seconds:.2f} s, {_describe_pace(clock)}",
             "Runtime": view.why or "all is well",
             "Robot": str(clock.failure or view.note or ("stands" if view.is_stopped else "walks")),
         }
@@ -65,5 +66,5 @@ def _legend() -> str:
     return (
         "<div style='font-size:.82em;margin:.2em .6em'>"
         + "&nbsp; ".join(parts)
-        + ": where it came down, and, small, where it may step</div>"
+        + "; bars: where it may step</div>"
     )

@@ -42,9 +42,9 @@ def _spotlight(
     if depth is None or attention is None:
         return Image.new("RGB", size, FAINT)
     rows = round((len(attention) * depth.shape[0] / depth.shape[1]) ** 0.5)
-    weight = np.sqrt(attention / attention.max()).reshape(rows, -1)
+    weight = (attention / attention.max()).reshape(rows, -1)
     share = _resize(weight, size)[..., None]
-    grey = 60.0 + 160.0 * _resize(0.5 - depth, size)[..., None]  # near is light
+    grey = 40.0 + 200.0 * _resize(0.5 - depth, size)[..., None]  # near is light
     mixed = (1.0 - share) * grey + share * np.array(GLOW)
     return Image.fromarray(np.clip(mixed, 0, 255).astype(np.uint8))
 

@@ -3,6 +3,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def page():
     page = server.open_page(CURBS, port)
     thread = threading.Thread(target=page.run)
     thread.start()
-    yield page, port
+    yield page, port, thread
     page.stop()
     thread.join()
     page.close()
@@ -38,6 +39,13 @@ def test_the_page_answers_on_this_machine(page):
     with urllib.request.urlopen(f"http://127.0.0.1:{page[1]}/", timeout=30) as answer:
         assert answer.status == 200
         assert b"<!doctype html>" in answer.read(200)
+
+
+def test_it_goes_on_drawing(page):
+    time.sleep(0.5)  # a dozen frames
+    page[0]._draw(1)
+    assert page[2].is_alive() and page[0].clock.failure is None
+    assert page[0].clock.share > 0.0
 
 
 def test_it_is_not_to_be_reached_from_elsewhere(page):

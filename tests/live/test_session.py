@@ -1,4 +1,5 @@
 import math
+import time
 from pathlib import Path
 
 import mujoco
@@ -8,7 +9,7 @@ import pytest
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, protocol, scene_suite, whole_robot
 from cref_jax.evaluation.scene_results import Condition
-from cref_jax.live import policies
+from cref_jax.live import film, policies
 from cref_jax.live.clock import Clock
 from cref_jax.live.session import OVER, Session, Wish
 from cref_jax.live.stage import Place, StageBuilder
@@ -176,6 +177,14 @@ def test_a_paused_clock_makes_single_steps():
     assert s.view().seconds == pytest.approx(0.06)
 
 
+def test_the_clock_says_how_fast_time_passed(monkeypatch):
+    """Steps of 20 ms, one every 40 ms: half of real time."""
+    clock = Clock(session())
+    clock._done.extend(0.04 * k for k in range(26))
+    monkeypatch.setattr(time, "perf_counter", lambda: 1.0)
+    assert clock.share == pytest.approx(0.5)
+
+
 @pytest.mark.parametrize(
     ("place", "message"),
     [
@@ -187,3 +196,45 @@ def test_a_paused_clock_makes_single_steps():
 def test_a_ground_that_there_is_not_is_one_line(place, message):
     with pytest.raises(ConfigError, match=message):
         StageBuilder(seed=0).build(ROBUST, place)
+
+
+def test_a_newer_state_of_the_policy_walks_from_the_next_start_on():
+    s, newer = session(), ROBUST._replace(detail="iteration 7")
+    s.take_policy(newer)
+    s.take_policy(policies.load(Path("mixed")))  # another policy: not a state of this one
+    assert steps(s, 5).stage.policy.detail == ""
+    s.reset()
+    view = steps(s, 5)
+    assert (view.stage.policy.name, view.stage.policy.detail) == ("robust", "iteration 7")
+
+
+def test_a_film_holds_every_second_step_until_it_ends():
+    s = session()
+    s.start_film()
+    steps(s, 10)
+    taken = s.end_film()
+    steps(s, 10)
+    assert len(taken.moments) == 5  # 25 of 50 per second
+    assert s.end_film() is None
+
+
+def test_another_ground_ends_a_film():
+    s = session()
+    s.start_film()
+    steps(s, 4)
+    s.begin(CURBS._replace(starts=CURBS.starts[1:]))
+    steps(s, 4)
+    assert len(s.end_film().moments) == 2
+
+
+@pytest.mark.slow
+def test_a_film_can_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(film, "SIZE", (64, 540))
+    s = session()
+    s.start_film()
+    steps(s, 4)
+    try:
+        film.write_film(tmp_path / "live.mp4", s.end_film())
+    except ConfigError as error:
+        pytest.skip(str(error))
+    assert (tmp_path / "live.mp4").stat().st_size > 500
