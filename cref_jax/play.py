@@ -168,7 +168,6 @@ def play(options: Options) -> None:
 
 def drive(options: Options) -> None:
     """Serve the page on which people drive the robot, until Ctrl-C."""
-    _check_options(options)
     if options.agent != "trained" or options.stills or options.out:
         raise ConfigError("--live goes without --agent, --stills and --out")
     source = sources.resolve_policy(options.run, options.policy)

@@ -22,7 +22,8 @@ LEAST_MOVE = 0.004  # rad; less is no movement
 MOST_YIELD = 0.3  # rad, of joints that are held; what moves more is not held
 BOTH_STAND = 0.1  # of the soles' directions; with more between them, not both feet stand
 AGAINST = -0.6  # correlation of turns; in simulation 0.8 to 1, with noise down to -0.3
-ACROSS = 0.8  # correlation of the base's pitch with the gyro's x; in simulation up to 0.54
+ACROSS = 0.8  # correlation of the base's pitch with the gyro's x; in simulation up to 0.54,
+MORE_THAN_ALONG = 0.3  # and 0.4 less than that with its y
 OTHER_SIDE = 0.5  # correlation; in simulation -1 to -0.9, with noise up to 0
 UNFOLLOWED = -0.4  # correlation; in simulation 0.7, with noise down to -0.1
 
@@ -72,8 +73,9 @@ class Nudge:
             return Status.OK
         moved, turn = np.diff(q, axis=0), 0.5 * (w[1:] + w[:-1]) * self._period
         by_legs = np.array([self._legs.turns(*step) for step in zip(q[1:], moved)])
-        pitch = _correlate(by_legs[..., 1].mean(axis=1), turn[:, 0], LEAST_TURN)
-        if abs(pitch) > ACROSS:
+        pitch = by_legs[..., 1].mean(axis=1)
+        across, along = (abs(_correlate(pitch, turn[:, axis], LEAST_TURN)) for axis in (0, 1))
+        if across > max(ACROSS, along + MORE_THAN_ALONG):
             self.detail = "by the legs the base pitches about the IMU's x"
             return Status.IMU_TURNED
         yaw = [_correlate(leg, turn[:, 2], LEAST_TURN) for leg in by_legs[..., 2].T]
