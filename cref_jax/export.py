@@ -15,7 +15,7 @@ from cref_jax.training import run_dir
 
 @dataclass(frozen=True)
 class Options(cli.PolicyOptions):
-    """Write a trained policy as a directory that numpy alone can run."""
+    """Write a trained policy as a directory that numpy alone can run, or C."""
 
     run: Path | None = None
     """runs/NAME, or a file that --learner wrote (default: the newest run)"""
@@ -52,6 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{options.out}: {size:.1f} MB; outputs match the trained network")
         print("\n".join(deploy.report(times)))
         print(f"on the robot: python {options.out}/cref_runtime.py --selftest {options.out}")
+        print(f"in C: cc -std=c99 -O2 -c {options.out}/cref_policy.c")
 
 
 def _export(options: Options) -> None:

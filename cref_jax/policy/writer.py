@@ -4,6 +4,7 @@ manifest.json      everything but the weights, with units, frames and origin
 weights.npz        float32 by flat names, uncompressed
 testvectors.npz    reference inputs and outputs of the trained network
 cref_runtime.py    deploy.py and runtime/ as one file, which runs the policy with numpy alone
+cref_policy.c, .h  the policy in C99 with its weights, for a robot's own controller
 """
 
 import hashlib
@@ -18,7 +19,7 @@ import numpy as np
 from cref_jax import deploy
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.policy import reader, reference_vectors, runtime_file
+from cref_jax.policy import c_files, reader, reference_vectors, runtime_file
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import pytree_digest
@@ -32,31 +33,34 @@ def write(policy: TrainedPolicy, world: World, out: Path) -> None:
     Raises:
         ConfigError: a file cannot be written, or another file is in its place.
     """
-    weights = pytree_digest.on_host(policy.train.params.actor["params"])
+    arrays = pytree_digest.on_host(policy.train.params.actor["params"])
+    weights = {name: x.astype(np.float32) for name, x in arrays.items()}
     files = {
-        "weights.npz": _to_npz({k: x.astype(np.float32) for k, x in weights.items()}),
+        "weights.npz": _to_npz(weights),
         "testvectors.npz": _to_npz(reference_vectors.build_test_vectors(world, policy.train)),
-        "cref_runtime.py": runtime_file.join_files(),
     }
-    _write_files(out, build_manifest(policy, world.physics.robot), files)
+    _write_files(out, build_manifest(policy, world.physics.robot), weights, files)
 
 
 def copy(policy: Path, out: Path) -> None:
-    """Write an exported policy again with the runtime of this version; all else stays as it is.
+    """Write an exported policy again with the runtimes of this version; all else stays as it is.
 
     Raises:
         ConfigError: it is not a policy directory, or a file cannot be written.
     """
-    content, _ = reader.read_contents(policy)
+    content, weights = reader.read_contents(policy)
     if not policy.is_dir():
         raise ConfigError(f"{policy} is not a directory")
     files = {name: (policy / name).read_bytes() for name in ("weights.npz", "testvectors.npz")}
+    _write_files(out, content, weights, files)
+
+
+def _write_files(
+    out: Path, content: dict[str, Any], weights: dict[str, np.ndarray], files: dict[str, bytes]
+) -> None:
+    """Write the files and the runtimes, a manifest with their digests, and one .zip beside them."""
     files["cref_runtime.py"] = runtime_file.join_files()
-    _write_files(out, content, files)
-
-
-def _write_files(out: Path, content: dict[str, Any], files: dict[str, bytes]) -> None:
-    """Write the files, a manifest with their digests, and one .zip beside them."""
+    files |= c_files.write_c(content, weights)
     content["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     content["digest"] = deploy.manifest_digest(content)
     files["manifest.json"] = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()

@@ -35,7 +35,8 @@ def directory(small_world, tmp_path):
 @pytest.mark.slow
 def test_a_directory_tests_itself_on_a_machine_with_nothing_but_numpy(directory):
     assert sorted(path.name for path in directory.iterdir()) == [
-        "cref_runtime.py", "manifest.json", "testvectors.npz", "weights.npz",
+        "cref_policy.c", "cref_policy.h", "cref_runtime.py", "manifest.json", "testvectors.npz",
+        "weights.npz",
     ]  # fmt: skip
     blocked = "import sys, runpy; sys.modules['jax'] = sys.modules['mujoco'] = None; "
     for target in (directory, directory.with_name("policy.zip")):
