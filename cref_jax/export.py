@@ -15,7 +15,7 @@ from cref_jax.training import run_dir
 
 @dataclass(frozen=True)
 class Options(cli.PolicyOptions):
-    """Write a trained policy as a directory that numpy alone can run, or C."""
+    """Write a trained policy as a directory that runs with numpy alone, or in C."""
 
     run: Path | None = None
     """runs/NAME, or a file that --learner wrote (default: the newest run)"""

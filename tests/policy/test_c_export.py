@@ -1,5 +1,6 @@
 """The policy in C says what the policy in numpy says, step by step and flag by flag."""
 
+import dataclasses
 import functools
 import re
 import subprocess
@@ -17,7 +18,7 @@ from c_policy import (
     write,
 )
 from robot_faults import Robot
-from tiny_policy import J, contents, metres, policy, recorded
+from tiny_policy import SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import deploy
 from cref_jax.deploy import Status
@@ -25,11 +26,12 @@ from cref_jax.policy import sources
 from cref_jax.runtime.status import STOPPING, WHY
 
 PERIOD = 0.02
+OVERLAPPING = dataclasses.replace(SMALL, convolutions=((4, 6, 4), (8, 5, 2)), actor=(9,))
 
 
-def tiny(variant="full", **guards):
+def tiny(variant="full", net=SMALL, **guards):
     """Return manifest and weights of a small random policy."""
-    manifest, arrays = contents(policy(variant))
+    manifest, arrays = contents(policy(variant, net))
     manifest["guards"].update(guards)
     return manifest, arrays
 
@@ -42,7 +44,8 @@ def programs(tmp_path_factory):
     @functools.cache
     def program(name):
         bundled = name in ("mixed", "robust")
-        source = deploy.contents(sources.bundled_policy(name)) if bundled else tiny(name)
+        made = {"overlapping": lambda: tiny("full", OVERLAPPING)}.get(name, lambda: tiny(name))
+        source = deploy.contents(sources.bundled_policy(name)) if bundled else made()
         return build(write(*source, folder / name))
 
     return program
@@ -76,8 +79,18 @@ def test_every_variant_of_the_network_says_in_c_what_it_says_in_numpy(
     variant, programs, monkeypatch
 ):
     leave_out_cross_checks(monkeypatch)
+    assert_says_the_same(tiny(variant), programs(variant))
+
+
+def test_filters_that_overlap_are_padded_as_in_numpy(programs, monkeypatch):
+    leave_out_cross_checks(monkeypatch)
+    assert_says_the_same(tiny("full", OVERLAPPING), programs("overlapping"))
+
+
+def assert_says_the_same(source, program):
+    """Give both 300 steps of random inputs, with resets and frames."""
     calls, expected = Calls(J), []
-    both = Both(*tiny(variant), calls, at_once=True)
+    both = Both(*source, calls, at_once=True)
     steps = recorded(300, sees=not both.blind)
     for t in range(300):
         if steps.reset[t]:
@@ -87,7 +100,7 @@ def test_every_variant_of_the_network_says_in_c_what_it_says_in_numpy(
         now = t * PERIOD
         expected.append(both.step(*(x[t] for x in steps[:5]), now=now, commanded=now))
     assert not any(step[0] & deploy.FAULTS for step in expected if isinstance(step, tuple))
-    answers = [answer for answer in calls.answer(programs(variant)) if answer is not None]
+    answers = [answer for answer in calls.answer(program) if answer is not None]
     assert_equal(answers, expected)
     assert np.std([step[1] for step in expected if isinstance(step, tuple)], axis=0).min() > 1e-3
 
@@ -135,6 +148,7 @@ def test_two_robots_side_by_side_with_every_fault_get_the_same_flags_and_targets
     source = tiny(variant, rate_rad=[0.3] * J, beyond_rad=[0.0] * J)
     for joint in source[0]["joints"]:
         joint["action_scale_rad"] = 10.0  # the targets reach every limit
+    source[0]["action"]["clip"] = 0.3
     program = build(write(*source, tmp_path))
     seen = compare_lives(source, program, (1, 2), 1000) | compare_lives(
         source, program, (5, 6), 1000
@@ -173,6 +187,31 @@ def test_an_action_that_is_not_finite_is_a_fault(tmp_path, monkeypatch):
     answers = calls.answer(build(write(manifest, arrays, tmp_path)))
     assert_equal(answers[2:], expected)
     assert expected[0][0] & Status.BAD_ACTION and expected[7][0] & Status.DAMPING
+
+
+@pytest.mark.parametrize(
+    ("turned", "angle", "flag"),
+    [
+        ((0, 6), 0.15, Status.NOT_ON_FEET),  # both hips by more than gravity may lean, 0.08
+        ((0, 6), 0.30, Status.OK),  # beyond 0.23 the robot moves by itself
+        ((0,), 0.15, Status.OK),  # soles more than 0.08 apart do not both stand
+    ],
+)
+def test_legs_that_turn_without_gravity_are_noticed_where_both_feet_stand(
+    turned, angle, flag, programs, monkeypatch
+):
+    leave_out_cross_checks(monkeypatch)
+    calls, expected = Calls(J), []
+    both = Both(*tiny("blind"), calls)
+    upright, still = np.float32([0.0, 0.0, -1.0]), np.zeros(3, np.float32)
+    for k in range(10):
+        q = both.joints.default.copy()
+        q[list(turned)] += np.float32(angle) * (k >= 5)
+        now = k * PERIOD
+        inputs = (still, upright, still, q, np.zeros(J, np.float32))
+        expected.append(both.step(*inputs, now=now, commanded=now))
+    assert [Status(step[0]) & Status.NOT_ON_FEET for step in expected] == [Status.OK] * 9 + [flag]
+    assert_equal(calls.answer(programs("blind"))[1:], expected)
 
 
 def halves() -> np.ndarray:

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import json
 import subprocess
 import sys
@@ -144,6 +145,16 @@ def test_an_exported_policy_is_written_again_with_this_versions_runtime(tmp_path
     assert {k: v for k, v in before.items() if k not in changed} == {
         k: v for k, v in after.items() if k not in changed
     }
+
+
+def test_the_files_in_c_have_digests_and_are_not_needed_by_the_runtime(tmp_path):
+    writer.copy(sources.bundled_policy(), tmp_path / "policy")
+    digests = reader.read_contents(tmp_path / "policy")[0]["files"]
+    for name in ("cref_policy.c", "cref_policy.h"):
+        file = tmp_path / "policy" / name
+        assert digests[name] == hashlib.sha256(file.read_bytes()).hexdigest()
+        file.unlink()
+    deploy.self_test(tmp_path / "policy", rounds=1)
 
 
 def test_a_bundled_policy_is_found_by_its_name_where_there_is_no_such_file(tmp_path, monkeypatch):

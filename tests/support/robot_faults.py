@@ -8,7 +8,7 @@ FAULTS = {  # probability that it begins in a step; all end after 1 to 15 steps
     "one_q": 0.003, "leans": 0.01, "pause": 0.01, "clock": 0.005, "no_time": 0.005,
     "old_command": 0.01,
     "far_command": 0.02, "no_frame": 0.02, "late_frame": 0.01, "frozen": 0.05, "holes": 0.2,
-    "too_many_holes": 0.01, "near": 0.01, "nothing": 0.01, "turned": 0.01, "no_stamp": 0.01,
+    "too_many_holes": 0.04, "near": 0.02, "nothing": 0.02, "turned": 0.01, "no_stamp": 0.01,
 }  # fmt: skip
 
 
@@ -36,8 +36,9 @@ class Robot:
         """Stand in the default pose, or in a squat with level feet, with all in order."""
         self._left = dict.fromkeys(FAULTS, 0)
         self.q = self._joints.default.copy()
-        self._left["leans"] = self._rng.integers(0, 20)  # too much, at first
-        self._left["turned"] = self._rng.integers(0, 20)
+        self._calm = self._rng.integers(20, 90)
+        if self._rng.random() < 0.3:  # at first
+            self._left["leans"] = self._left["turned"] = self._rng.integers(0, 20)
         if self._rng.random() < 0.5:
             for side in (0, 6):  # hip and ankle take back what the knee bends
                 self.q[side : side + 5] += np.array([-0.5, 0.0, 0.0, 1.0, -0.5], np.float32)
@@ -47,11 +48,12 @@ class Robot:
         for name, chance in FAULTS.items():
             if self._left[name] == 1:
                 self._calm = self._rng.integers(0, 80)
+                self._left["gyro"] += 2 * (name == "q")  # what was before is of no use then
             self._left[name] = max(self._left[name] - 1, 0)
             if not self._calm and self._rng.random() < chance:
                 self._left[name] = self._rng.integers(1, 16)
         self._calm = max(self._calm - 1, 0)
-        self.now += PERIOD * (4.0 if self._left["pause"] == 1 else 1.0)
+        self.now += PERIOD * (3.0 if self._left["pause"] == 1 else 1.0)
         self.now -= 1.0 if self._left["clock"] == 1 else 0.0
 
     def measure(self) -> tuple[list[np.ndarray], float, float]:
@@ -70,9 +72,9 @@ class Robot:
         if left["fallen"]:
             gravity = np.float32([0.8, 0.0, -0.6]) * np.float32([1.0, 0.0, -1.0])
         if left["m/s^2"]:
-            gravity *= np.float32(9.81)
+            gravity *= self._rng.choice(np.float32([9.81, 0.5]))
         if left["q"]:
-            q[self._rng.integers(len(q))] = 40.0
+            q[self._rng.integers(len(q))] = self._rng.choice([40.0, -40.0])
         if left["one_q"]:
             q[:] = 0.1
         inputs = [w, gravity, command, q, qd]
@@ -100,6 +102,7 @@ class Robot:
             frame = frame[::-1].copy()
         if left["near"]:
             frame[36:] = 0.2
+            frame[40:] *= self._rng.choice([1.0, 10.0])  # a band that hides no feet
         if left["nothing"]:
             frame[:] = 5.0
         if left["holes"]:

@@ -17,9 +17,9 @@
                puts(cref_status_text(left));
        }
 
-   Any number of policies run side by side, each in a struct of its own. Calls for the same struct
-   must not overlap: if frames come in a thread of their own, take a lock around each call. A call
-   needs a few kB of stack. Compile without -ffast-math: NaN must be noticed. The robot itself needs
+   Any number of robots run side by side, each with a struct of its own; a program holds one export.
+   Calls for the same struct must not overlap: if frames come in a thread of their own, take a lock
+   around each call. A call needs about 10 kB of stack with the default sizes. Compile without -ffast-math: NaN must be noticed. The robot itself needs
    a watchdog that damps when no target has come for 0.1 s. */
 
 #ifndef CREF_POLICY_H
