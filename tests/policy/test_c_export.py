@@ -148,7 +148,7 @@ def test_two_robots_side_by_side_with_every_fault_get_the_same_flags_and_targets
     source = tiny(variant, rate_rad=[0.3] * J, beyond_rad=[0.0] * J)
     for joint in source[0]["joints"]:
         joint["action_scale_rad"] = 10.0  # the targets reach every limit
-    source[0]["action"]["clip"] = 0.3
+    source[0]["action"]["clip"] = 0.1
     program = build(write(*source, tmp_path))
     seen = compare_lives(source, program, (1, 2), 1000) | compare_lives(
         source, program, (5, 6), 1000

@@ -101,8 +101,8 @@ class Robot:
         if left["turned"]:
             frame = frame[::-1].copy()
         if left["near"]:
-            frame[36:] = 0.2
-            frame[40:] *= self._rng.choice([1.0, 10.0])  # a band that hides no feet
+            frame[32:] = 0.2
+            frame[41:] *= self._rng.choice([1.0, 10.0])  # a band that hides no feet
         if left["nothing"]:
             frame[:] = 5.0
         if left["holes"]:
