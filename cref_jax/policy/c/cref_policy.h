@@ -2,8 +2,9 @@
 
    It computes what cref_runtime.py of the same export computes, and refuses the same single inputs,
    but it does not compare the senses with each other: a gyro with a wrong sign, joints that are
-   exchanged or a mirrored camera go unnoticed here. Before the first walk, record the robot with
-   the same wiring and run the recordings through `python cref_runtime.py --check`.
+   exchanged or a mirrored camera go unnoticed here. Before the first walk, record what the robot
+   measures, as an .npz of the arrays that the recorder of cref_runtime.py writes, and run the
+   recordings through `python cref_runtime.py --check last.npz policy` and `--replay`.
 
        static cref_policy policy;
        cref_reset(&policy);
@@ -19,8 +20,9 @@
 
    Any number of robots run side by side, each with a struct of its own; a program holds one export.
    Calls for the same struct must not overlap: if frames come in a thread of their own, take a lock
-   around each call. A call needs about 10 kB of stack with the default sizes. Compile without -ffast-math: NaN must be noticed. The robot itself needs
-   a watchdog that damps when no target has come for 0.1 s. */
+   around each call. A call needs about 10 kB of stack with the bundled policies' sizes. Compile
+   without -ffast-math: NaN must be noticed. The robot itself needs a watchdog that damps when no
+   target has come for 0.1 s. */
 
 #ifndef CREF_POLICY_H
 #define CREF_POLICY_H
@@ -41,7 +43,8 @@ struct cref_joint {
     float kp, kd;                  /* of its PD loop, N m/rad and N m s/rad */
     float effort;                  /* most torque, N m */
     float action_scale;            /* rad per unit of the network's action */
-    float rate, beyond;            /* most change of a target per step, most way beyond the range, rad */
+    float rate;                    /* most change of a target per step, rad */
+    float beyond;                  /* most way of a target beyond the range, rad */
 };
 
 /* In the order of all arrays, which the robot's must equal. */
