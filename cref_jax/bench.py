@@ -22,7 +22,7 @@ from jax.sharding import PartitionSpec as P
 from rich.console import Console
 from rich.table import Table
 
-from cref_jax import cli, config
+from cref_jax import cli, config, robot
 from cref_jax.benchmarks import brax_peer, roofline, stages, warp_raycast
 from cref_jax.benchmarks.roofline import Rates
 from cref_jax.config import Config, limits, presets
@@ -45,6 +45,8 @@ class Options(cli.DebugOption):
 
     terrain: str = "mixed"
     """terrain name"""
+    robot: str | None = None
+    """a robot by name (default: the first)"""
     num_envs: Annotated[tuple[int, ...], Within(1, 1_000_000)] = (64, 256)
     """numbers of parallel robots; every stage is measured with each"""
     repeats: Annotated[int, Within(1, 1000)] = 5
@@ -105,7 +107,8 @@ def measure_stages(options: Options, rates: Rates) -> list[StageTime]:
                 world, state = _init_run(_stage_config(options, most), engine)
                 rows += _measure_engine(options, rates, engine, world, state.robots)
     with console.status("whole iteration: compiling and timing"):
-        rows.append(_time_iteration(options, ITERATION, _build_preset(options.terrain)))
+        c = _build_preset(options, options.terrain)
+        rows.append(_time_iteration(options, ITERATION, c))
     if options.brax:
         with console.status("brax's PPO: compiling and timing"):
             rows += _measure_learners(options)
@@ -114,7 +117,7 @@ def measure_stages(options: Options, rates: Rates) -> list[StageTime]:
 
 def _measure_learners(options: Options) -> list[StageTime]:
     """Measure an iteration of our PPO and of brax's, blind on flat ground."""
-    c = _build_preset("flat", {"network": {"variant": "blind"}})
+    c = _build_preset(options, "flat", {"network": {"variant": "blind"}})
     seconds = c.run.num_envs / brax_peer.measure_samples_per_second(c)
     return [_time_iteration(options, BLIND, c), StageTime(BRAX, c.run.num_envs, seconds, 0.0)]
 
@@ -154,19 +157,20 @@ def _measure_engine(
 
 
 def _stage_config(options: Options, count: int) -> Config:
-    return _build_preset(options.terrain, {"run": {"num_envs": count}, "ppo": {"epochs": 1}})
+    changes = {"run": {"num_envs": count}, "ppo": {"epochs": 1}}
+    return _build_preset(options, options.terrain, changes)
 
 
-def _build_preset(terrain: str, changes: dict[str, Any] | None = None) -> Config:
+def _build_preset(options: Options, terrain: str, changes: dict[str, Any] | None = None) -> Config:
     """Build the settings of `make train` on this device, with these changes.
 
     Raises:
-        ConfigError: the terrain or a setting is invalid.
+        ConfigError: the terrain, the robot or a setting is invalid.
     """
     device = "cpu" if jax.default_backend() == "cpu" else "gpu"
     c = config.override(presets.build_config(terrain, None, device), changes or {})
     limits.check(c)
-    return c
+    return robot.fill_in(c, options.robot)
 
 
 def _init_run(c: Config, engine: EngineName) -> tuple[World, iteration.RunState]:
@@ -178,7 +182,7 @@ def _init_run(c: Config, engine: EngineName) -> tuple[World, iteration.RunState]
 
 def compare_depth(options: Options) -> list[warp_raycast.Speed]:
     """Measure the depth camera and its peers on a flight of stairs."""
-    c = config.override(Config(), {"terrain": {"name": "stairs"}})
+    c = config.override(robot.fill_in(Config(), options.robot), {"terrain": {"name": "stairs"}})
     lane = lanes.build_single(c.terrain, "stairs_up", 0.15)
     with Console().status("depth: compiling and timing"):
         return warp_raycast.compare_renderers(lane.tile(0, 0), c.camera, lane.is_profile[0])
@@ -188,7 +192,7 @@ def show(
     options: Options, rates: Rates, rows: list[StageTime], speeds: list[warp_raycast.Speed]
 ) -> None:
     """Print the tables and the ratios."""
-    table = Table(title=f"{options.terrain}, {_machine_name()}")
+    table = Table(title=f"{robot.name_robot(options.robot)}, {options.terrain}, {_machine_name()}")
     columns = (
         "stage",
         "robots",
@@ -244,6 +248,7 @@ def as_json(
         "machine": _machine_name(),
         "rates": rates._asdict(),
         "terrain": options.terrain,
+        "robot": robot.name_robot(options.robot),
         "rows": [row._asdict() for row in rows],
         "ratios": ratios(rows),
         "depth": [speed._asdict() for speed in speeds],

@@ -35,6 +35,8 @@ class PolicyOptions(DebugOption):
     """runs/NAME (default: the newest run, or the bundled policy where there is none)"""
     policy: Path | None = None
     """an exported policy instead of a run"""
+    robot: str | None = None
+    """a robot by name: its newest run (default: any); another robot's is an error"""
 
 
 def parse(options: type[R], arguments: Sequence[str] | None, command: str) -> R:

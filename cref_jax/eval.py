@@ -52,6 +52,8 @@ class Options(cli.DebugOption):
     such as seeds of one training, the table pools their trials"""
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
+    robot: str | None = None
+    """a robot by name: its newest run (default: any); another robot's is an error"""
     suite: Suite | None = None
     """table: the twelve cells of Table II and the failures of Table III; robust: the same with
     masses, friction, motors, delays, sensors, pushes and camera mount randomised, and with each of
@@ -123,7 +125,9 @@ def _resolve_sources(options: Options) -> list[Path]:
     given = [*options.run, *map(sources.find_policy, options.policy)]
     if len(given) > 1 and options.suite not in (None, "table"):
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
-    return given or [sources.resolve_policy(None, None)]
+    for path in given:
+        sources.check_robot(path, options.robot)
+    return given or [sources.resolve_policy(None, None, options.robot)]
 
 
 def _suite_for(terrains: list[str]) -> Suite:

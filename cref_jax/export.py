@@ -37,12 +37,12 @@ def main(arguments: list[str] | None = None) -> None:
             raise ConfigError(f"--out must be a folder with a name, not {options.out}")
         if options.learner:
             out = cli.prepare_output(options.learner, ".npz", "--learner")
-            _write_learner(options.run or run_dir.newest(), out)
+            _write_learner(_resolve_run(options), out)
             return
         cli.prepare_output(options.out.with_name(options.out.name + ".zip"), ".zip")
         run_dir.check_writable(options.out)
         if options.policy:
-            source = sources.resolve_policy(options.run, options.policy)
+            source = sources.resolve_policy(options.run, options.policy, options.robot)
             print(sources.summarize(source), flush=True)
             writer.copy(source, options.out)
         else:
@@ -57,13 +57,20 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _export(options: Options) -> None:
     """Write the run's newest policy."""
-    run = options.run or run_dir.newest()
+    run = _resolve_run(options)
     from_file = learner_file.is_learner(run)
     world = build_world((learner_file if from_file else run_dir).read_config(run), "mujoco")
     print(f"exporting {run} ...", flush=True)
     policy = learner_file.read(run, world) if from_file else trained.load_policy(run, world)
     print(sources.describe(run, policy), flush=True)
     writer.write(policy, world, options.out)
+
+
+def _resolve_run(options: Options) -> Path:
+    """Return the run as given, or the newest one of the robot."""
+    run = options.run or run_dir.newest(robot=options.robot)
+    sources.check_robot(run, options.robot)
+    return run
 
 
 def _write_learner(run: Path, out: Path) -> None:

@@ -98,6 +98,8 @@ class Options(cli.DebugOption):
     """GPU to compile for"""
     terrain: str = "mixed"
     """terrain name"""
+    robot: str | None = None
+    """a robot by name (default: the first)"""
     num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
     """parallel robots (default: as in `make train` on a GPU)"""
 
@@ -115,7 +117,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a mistake in it is one line and exit code 2."""
     with cli.one_line_errors(arguments):
         options = cli.parse(Options, arguments, "gpu_program")
-        c = presets.build_config(options.terrain, None, "gpu")
+        c = robot.fill_in(presets.build_config(options.terrain, None, "gpu"), options.robot)
         if options.num_envs is not None:
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=options.num_envs))
         limits.check(c)

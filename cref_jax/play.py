@@ -139,8 +139,9 @@ def main(arguments: list[str] | None = None) -> None:
 def play(options: Options) -> None:
     """Simulate, film and summarise one episode."""
     is_trained = options.agent == "trained"
-    source = sources.resolve_policy(options.run, options.policy) if is_trained else options.run
-    c = sources.read_config(source) if source else Config()
+    choose = lambda: sources.resolve_policy(options.run, options.policy, options.robot)
+    source = choose() if is_trained or options.run else None
+    c = sources.read_config(source) if source else robot.fill_in(Config(), options.robot)
     suffix = ".png" if options.stills else ".mp4"
     folder = source if source and sources.is_run(source) else Path()
     out = cli.prepare_output(options.out or folder / f"play{suffix}", suffix)

@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> None:
         options = cli.parse(Options, arguments, "report")
         if options.out:
             cli.prepare_output(options.out, ".html")
-        source = sources.resolve_policy(options.run, options.policy)
+        source = sources.resolve_policy(options.run, options.policy, options.robot)
         with contextlib.suppress(ConfigError):  # a damaged run still gets a page of what is left
             print(sources.summarize(source), flush=True)
         if options.policy or (options.run is None and not sources.is_run(source)):

@@ -45,6 +45,8 @@ class Options(cli.DebugOption):
 
     policy: Path | None = None
     """what `python -m cref_jax.export` wrote, or its .zip (default: the bundled policy)"""
+    robot: str | None = None
+    """a robot by name (default: the policy's own); another robot's policy is an error"""
     kind: Annotated[str, tyro.conf.arg(help=f"kind of lane: {', '.join(KINDS)}")] = "flat"
     size: Annotated[float, Within(0, 100)] = 0.0
     """size of the obstacles, m; for a slope its gradient"""
@@ -78,6 +80,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.out:
             cli.prepare_output(options.out, ".json")
         path = sources.find_policy(options.policy or sources.bundled_policy())
+        sources.check_robot(path, options.robot)
         policy = reader.read(path)
         print(sources.describe(path, policy), flush=True)
         physics = build_world(policy.config, "mujoco").physics

@@ -25,6 +25,7 @@ from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
 from cref_jax.policy import learner_file, sources, trained, warm_start
 from cref_jax.rendering import map_plot
+from cref_jax.robot import ROBOTS, fill_in
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
@@ -51,6 +52,9 @@ class Options(cli.DebugOption):
     ] = "flat"
     experiment: str | None = None
     """a file in experiments/ (without .toml) or a path: differences from the defaults"""
+    robot: Annotated[
+        str | None, tyro.conf.arg(help=f"{', '.join(ROBOTS)}; short for --robot.name")
+    ] = None
     num_envs: int | None = None
     """environments; short for --run.num-envs"""
     iterations: int | None = None
@@ -134,7 +138,9 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     command = tyro.cli(Command, args=arguments, default=default, prog=PROGRAM)
     init = command.options.init and sources.find_policy(command.options.init)
     options = dataclasses.replace(command.options, device=options.device, init=init)
-    c = _with_short_options(command.settings, options)
+    c = fill_in(_with_short_options(command.settings, options), options.robot)
+    if options.resume:
+        sources.check_robot(options.run_dir or Path(), c.robot.name)
     if init:
         c = _with_init(c, options)
     limits.check(c)
@@ -267,8 +273,8 @@ def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[s
     device = jax.devices()[0].device_kind
     start = f", from iteration {first}" if first else ""
     headline = (
-        f"{run}: {c.terrain.name} with {c.run.num_envs} robots, engine {engine}, on {device}; "
-        f"iterations {c.run.iterations}{start}"
+        f"{run}: {c.robot.name} on {c.terrain.name}, {c.run.num_envs} robots, engine {engine}, "
+        f"on {device}; iterations {c.run.iterations}{start}"
     )
     if options.init:
         return [headline, f"begins as {sources.summarize(options.init)}"]
@@ -310,6 +316,7 @@ def _with_init(c: Config, options: Options) -> Config:
     """
     if options.resume:
         raise ConfigError("give --init or --resume, not both")
+    sources.check_robot(options.init or Path(), c.robot.name)
     theirs, ours = sources.read_config(options.init or Path()).network, c.network
     for name, value in dataclasses.asdict(theirs).items():
         if name not in NOT_OF_THE_ACTOR and value != getattr(ours, name):
@@ -332,6 +339,7 @@ def _has_critic(init: Path, c: Config) -> bool:
 def _name(options: Options) -> str:
     """Return the name of a new run."""
     parts = [Path(options.terrain).stem]
+    parts += [options.robot] if options.robot else []
     parts += [Path(options.experiment).stem] if options.experiment else []
     parts += [f"seed{options.seed}"] if options.seed is not None else []  # jobs of one second
     return "-".join([*parts, datetime.datetime.now().strftime("%Y%m%d-%H%M%S")])

@@ -35,7 +35,7 @@ class Options:
 def main() -> None:
     """Render one image per kind and draw them side by side."""
     options = tyro.cli(Options)
-    c = config.Config()
+    c = robot.fill_in(config.Config())
     atlas = lanes.build(config.Terrain(name="mixed"))
     figure, axes = plt.subplots(2, 4, figsize=(11, 4.6), constrained_layout=True)
     views = {

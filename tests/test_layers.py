@@ -126,10 +126,11 @@ def test_only_one_file_touches_mjx():
     assert users == ["physics.mjx_engine"]
 
 
-def test_only_the_robots_room_names_a_joint_or_a_body():
+def test_only_the_robots_room_names_a_robot_a_joint_or_a_body():
     models = [mujoco.MjSpec.from_file(str(robot.xml)) for robot in ROBOTS.values()]
     parts = [[*m.bodies, *m.joints, *m.geoms, *m.sites] for m in models]
     names = {part.name for part in itertools.chain(*parts)} - {"", "world"}
+    names |= {*ROBOTS, *(robot.title for robot in ROBOTS.values())}
     assert "left_knee_joint" in names
     for name in (name for name in MODULES if room(name) != "robot"):
         constants = {n.value for n in ast.walk(tree(name)) if isinstance(n, ast.Constant)}

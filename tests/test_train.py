@@ -41,6 +41,16 @@ def test_runs_of_several_seeds_begun_in_one_second_have_names_of_their_own():
     named = lambda seed: train._name(train.Options(terrain="my/map.npy", seed=seed))
     assert len({named(seed) for seed in (0, 1, 2)}) == 3
     assert named(3).startswith("map-seed3-")
+    assert train._name(train.Options(terrain="gap", robot="g1")).startswith("gap-g1-")
+
+
+def test_the_settings_have_the_robots_name_and_numbers():
+    _, c = train.parse([*TINY, "--robot", "g1"])
+    assert (c.robot.name, c.camera.pitch, c.reward.feet_y_target) == ("g1", 47.6, 0.237)
+    _, c = train.parse([*TINY, "--robot.name", "g1", "--camera.pitch", "45"])
+    assert (c.robot.name, c.camera.pitch) == ("g1", 45.0)
+    _, c = train.parse(TINY)
+    assert (c.robot.name, c.camera.pitch) == ("x2_ultra", 50.0)
 
 
 def test_a_resumed_run_keeps_its_terrain_and_its_experiment(first, tmp_path):
@@ -49,6 +59,8 @@ def test_a_resumed_run_keeps_its_terrain_and_its_experiment(first, tmp_path):
     assert c.terrain.name == "flat"
     with pytest.raises(ConfigError, match=f"terrain 'flat', not 'gap'; .* --init {first}"):
         train.parse([*resume, "--terrain", "gap"])
+    with pytest.raises(ConfigError, match=f"{first} is of the robot 'x2_ultra', not of 'g1'"):
+        train.parse([*resume, "--robot", "g1"])
     copy = tmp_path / "copy"
     shutil.copytree(first, copy)
     origin = json.dumps({"command": ["train.py", "--experiment", "smoke"]})
@@ -164,6 +176,8 @@ def state_of(folder: Path) -> list[np.ndarray]:
             ["--coordinator", "a:1", "--num-processes", "2", "--process-id", "2"],
             "--process-id must be 0 to 1, not 2",
         ),
+        (["--robot", "g2"], "unknown robot 'g2'; did you mean 'g1'?"),
+        (["--robot", "g1", "--init", BUNDLED], "is of the robot 'x2_ultra', not of 'g1'"),
         (["--init", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
         (
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],

@@ -5,6 +5,7 @@ kernels run on one thread, as does MuJoCo's ray-cast.
 """
 
 import importlib.util
+import math
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -127,7 +128,8 @@ def _sample_poses(
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     rotation, quat, matrix = np.empty((CAMERAS, 3, 3)), np.empty(4), np.empty(9)
     for k, (yaw, pitch, roll) in enumerate(rng.uniform(-TURN, TURN, (CAMERAS, 3))):
-        mujoco.mju_euler2Quat(quat, np.array([yaw, np.radians(camera.pitch) + pitch, roll]), "zyx")
+        down = math.radians(camera.pitch) + pitch
+        mujoco.mju_euler2Quat(quat, np.array([yaw, down, roll]), "zyx")
         mujoco.mju_quat2Mat(matrix, quat)
         rotation[k] = matrix.reshape(3, 3) @ level
     position = np.stack([x, np.full(CAMERAS, origin[1] + 0.5 * heights.shape[1] * ground.cell), z])

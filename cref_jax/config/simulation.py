@@ -8,7 +8,7 @@ from typing import Literal
 class Robot:
     """The robot, and how the policy drives it (Sec. III-A)."""
 
-    name: str = "x2_ultra"  # an entry of robot/registry.py
+    name: str | None = None  # an entry of robot/registry.py; None: its first
     actuated: Literal["legs", "legs+waist", "all"] = "legs"  # assumed: Table I regularises these
     held: Literal["none", "waist", "all"] = "all"
     """Joints outside the policy that stay movable under PD; all others are welded. assumed: with
@@ -35,7 +35,11 @@ class Physics:
 
 @dataclass(frozen=True)
 class Terrain:
-    """The lanes of training. Sizes of obstacles are in terrains/*.toml."""
+    """The lanes of training.
+
+    Sizes of obstacles are in terrains/*.toml, the same for every robot: the legs of those here are
+    of one length within 2 %. docs/your_robot.md says what another length asks for.
+    """
 
     name: str = "flat"  # a file in terrains/, or a path to .toml, .npy or .png
     cell: float = 0.02  # m; assumed: divides treads, windows and strides
@@ -69,7 +73,7 @@ class Camera:
     """deg, vertical, horizontal; D435i data sheet, for streams of 16:9. assumed: one of these,
     squeezed, since those of 4:3 show less, 62 x 75"""
     d_max: float = 3.0  # m, Sec. II-B; assumed: published work clips at 2 to 3 m
-    pitch: float = 50.0  # deg below the horizontal, Sec. III-A
+    pitch: float | None = None  # deg below the horizontal, Sec. III-A; None: the robot's
     rate: float = 20.0  # 1/s, Sec. II-D
     window: int = 1
     """Pixels, odd: side of the square around each pixel whose nearest depth it reads, as a stereo
@@ -92,8 +96,10 @@ class Foothold:
     roughness: float = 0.010  # m, r_th; assumed: refuses windows with an edge of 5 cm in them
     verticality: float = 0.9  # eta_th; assumed: slopes up to 0.4 pass, windows over a riser do not
     min_height: float = -0.5  # m, h_min; assumed: two 23 cm treads down pass, a gap's floor not
-    quality_x: tuple[float, float, int] = (-0.06, 0.13, 5)  # m from, m to, samples of the sole
-    quality_y: tuple[float, float, int] = (-0.05, 0.05, 3)  # m from, m to, samples of the sole
+    quality_x: tuple[float, float, int] | None = None
+    """m from, m to, samples of the sole; None: the robot's"""
+    quality_y: tuple[float, float, int] | None = None
+    """m from, m to, samples of the sole; None: the robot's"""
     quality_depth: float = -0.03
     """m under the sole, epsilon of the contact quality. assumed: BeamDojo's -0.1 is an absolute
     height, and stairs have no level to measure it from"""

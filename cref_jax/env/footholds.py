@@ -188,6 +188,7 @@ def count_unsupported(ground: Terrain, feet: Soles, c: config.Foothold) -> Int[A
     After BeamDojo (arXiv 2502.10363). The samples lie about the ankle's origin, turned by the
     foot's yaw; z_sole is the centre's.
     """
+    assert c.quality_x and c.quality_y  # by robot.fill_in
     grid = np.stack(np.meshgrid(np.linspace(*c.quality_x), np.linspace(*c.quality_y)), axis=-1)
     offsets = jnp.asarray(grid.reshape(-1, 2), jnp.float32)
     points = geometry.rotate_yaw(feet.heading[:, None], offsets) + feet.ankle[:, None, :2]

@@ -21,10 +21,11 @@ MOST_INVALID = 0.5  # share of a frame's pixels; assumed: beyond it, the last fr
 
 def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]:
     """Build everything but the weights, without digests."""
-    c = policy.config
+    c = robot.fill_in(policy.config)
     return {
         "format": "cref-policy",
         "schema": deploy.SCHEMA,
+        "robot": c.robot.name,
         "rates": {
             "control_hz": 1.0 / c.physics.control_period,
             "depth_hz": c.camera.rate,

@@ -8,22 +8,47 @@ from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, reader, trained
 from cref_jax.policy.trained import TrainedPolicy, count_samples
+from cref_jax.robot.registry import describe as describe_robot
+from cref_jax.robot.registry import name_robot
 from cref_jax.training import run_dir
 
 BUNDLED = "mixed"  # the policy included in the package
 
 
-def resolve_policy(run: Path | None, policy: Path | None) -> Path:
+def resolve_policy(run: Path | None, policy: Path | None, robot: str | None = None) -> Path:
     """Choose the run or the policy as given, else the newest run, else the bundled policy.
 
     Raises:
-        ConfigError: both are given.
+        ConfigError: both are given, or there is none of this robot.
     """
     if run and policy:
         raise ConfigError("give --run or --policy, not both")
+    if given := run or (policy and find_policy(policy)):
+        check_robot(given, robot)
+        return given
+    bundled = bundled_policy()
+    if robot is not None and robot != _robot_of(bundled):
+        describe_robot(robot)
+        return run_dir.newest(robot=robot)
     with contextlib.suppress(ConfigError):
-        return run or (policy and find_policy(policy)) or run_dir.newest()
-    return bundled_policy()
+        return run_dir.newest(robot=robot)
+    return bundled
+
+
+def check_robot(path: Path, robot: str | None) -> None:
+    """Refuse a run or policy of another robot than the one asked for; None: any will do.
+
+    Raises:
+        ConfigError: says whose it is.
+    """
+    if robot is not None:
+        describe_robot(robot)
+        if robot != (own := _robot_of(path)):
+            raise ConfigError(f"{path} is of the robot '{own}', not of '{robot}'")
+
+
+def _robot_of(path: Path) -> str:
+    return name_robot(read_config(path).robot.name)
 
 
 def bundled_policy(name: str = BUNDLED) -> Path:
@@ -82,16 +107,17 @@ def summarize(path: Path) -> str:
 def _line(path: Path, c: Config, iteration: int) -> str:
     sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
     samples = f"{count_samples(c, iteration) / 1e6:.1f} M samples"
-    return f"{path}: {sees}, trained on {c.terrain.name} for {samples}"
+    return f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {samples}"
 
 
 def load(path: Path, world: World) -> TrainedPolicy:
     """Load the policy of a run, a learner file or an export, for evaluation in JAX.
 
     Raises:
-        ConfigError: it is none of these.
+        ConfigError: it is none of these, or of another robot than the world's.
         CheckpointError: the run has no readable checkpoint.
     """
+    check_robot(path, name_robot(world.config.robot.name))
     if learner_file.is_learner(path):
         return learner_file.read(path, world)
     return trained.load_policy(path, world) if is_run(path) else reader.read(path, world)

@@ -37,7 +37,7 @@ def build(
     moves: robot.Actuated,
     physics: config.Physics,
     ground: Terrain,
-    name: str = config.Robot.name,
+    name: str | None = None,
 ) -> mujoco.MjModel:
     """Build the model to render; qpos is that of the physics, x and y are those of `ground`."""
     heights, origin = window(ground)
@@ -51,7 +51,7 @@ def build(
 
 
 def build_stage(
-    moves: robot.Actuated, physics: config.Physics, z: float, name: str = config.Robot.name
+    moves: robot.Actuated, physics: config.Physics, z: float, name: str | None = None
 ) -> mujoco.MjSpec:
     """Build the spec of the robot with lights, above an infinite plain at height z, m."""
     spec = robot.spec(moves, physics, contact_planes=0, visual=True, name=name)

@@ -14,11 +14,12 @@ from cref_jax.robot.model import (
     solve_sparsely,
     spec,
 )
-from cref_jax.robot.registry import fill_in
+from cref_jax.robot.registry import ROBOTS, fill_in, name_robot
 
 __all__ = [
     "FRICTION",
     "MOVING",
+    "ROBOTS",
     "Actuated",
     "Capsules",
     "Mount",
@@ -28,6 +29,7 @@ __all__ = [
     "fill_in",
     "load",
     "moving",
+    "name_robot",
     "solve_sparsely",
     "spec",
 ]

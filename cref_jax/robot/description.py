@@ -3,9 +3,11 @@
 Conventions of the MJCF, checked by `model.spec` and named in one line where they are not kept:
 
 - One free body comes first, the base; every other joint is a hinge about its body's origin.
-- Names of parts on both sides begin with `left_` and `right_`, and are mirror images.
+- Names of parts on both sides begin with `left_` and `right_`; the right one is the mirror image.
+- Joints come in the order legs, waist, all others, and actuators in that of the joints.
 - A joint has a range, its speed limit in rad/s as the first value of `user`, and a position
-  actuator of the same order, with kp, kv and a force range.
+  actuator with kp, kv and a force range.
+- Nothing collides by itself, and there are no sensors, keyframes, pairs, equalities or tendons.
 - Spheres, and nothing else, touch the ground; their names begin with the names in `soles` for the
   feet. Capsules are the shapes of links, for depth and for noticing a fall.
 - The sites of `camera` and `imu` exist, x forward and z up in the nominal pose.
@@ -56,6 +58,12 @@ class Description:
     """m, the base above the supporting ankles: lower, and the robot has fallen."""
     feet_apart: float
     """m, from ankle to ankle (Table I)."""
+    sole_x: tuple[float, float, int]
+    """m from, m to, samples along the sole, from the ankle (foot contact quality)."""
+    sole_y: tuple[float, float, int]
+    """m from, m to, samples across the sole, from the ankle (foot contact quality)."""
+    camera_pitch: float
+    """deg, the depth camera's optical axis below the x axis of its site."""
     camera: str = "depth_camera"
     """Site of the depth camera."""
     imu: str = "imu"

@@ -132,15 +132,16 @@ def spec(
     physics: config.Physics,
     contact_planes: int = 1,
     visual: bool = False,
-    name: str = config.Robot.name,
+    name: str | None = None,
 ) -> mujoco.MjSpec:
     """Build the model of the robot `name` in which only the joints of `moves` move.
 
-    The others are welded at the nominal pose, and links that no joint moves any more are fused
-    with their parent. Each contact sphere gets `contact_planes` mocap bodies, each with a plane
-    that only this sphere collides with: the caller keeps it tangent to the ground. Body, geom and
-    pair have the name `plane_{sphere}_{k}`; the mocap bodies come in the order sphere, then k.
-    Without `visual`, the shapes that take no part in the physics are left out.
+    Without a name it is the first robot. The other joints are welded at the nominal pose, and links
+    that no joint moves any more are fused with their parent. Each contact sphere gets
+    `contact_planes` mocap bodies, each with a plane that only this sphere collides with: the caller
+    keeps it tangent to the ground. Body, geom and pair have the name `plane_{sphere}_{k}`; the
+    mocap bodies come in the order sphere, then k. Without `visual`, the shapes that take no part in
+    the physics are left out.
 
     Raises:
         ConfigError: there is no such robot, or its MJCF does not keep the conventions.
@@ -170,7 +171,7 @@ def spec(
     return s
 
 
-def add_force_sensors(spec: mujoco.MjSpec, name: str = config.Robot.name) -> None:
+def add_force_sensors(spec: mujoco.MjSpec, name: str | None = None) -> None:
     """Add sensors of the net contact force that each foot exerts, in the world frame."""
     for foot in describe(name).feet:
         spec.add_sensor(
@@ -204,7 +205,7 @@ def _weld(s: mujoco.MjSpec, joint: mujoco.MjsJoint, angle: float) -> None:
     mujoco.mju_axisAngle2Quat(turn, joint.axis, angle)
     mujoco.mju_mulQuat(turned, body.quat, turn)
     body.quat = turned
-    s.delete(s.actuator(joint.name))
+    s.delete(next(motor for motor in s.actuators if motor.target == joint.name))
     s.delete(joint)
 
 

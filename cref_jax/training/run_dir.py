@@ -25,6 +25,7 @@ import jax
 
 from cref_jax.config import Config, presets
 from cref_jax.errors import ConfigError
+from cref_jax.robot.registry import name_robot
 from cref_jax.terrain import map_files
 from cref_jax.training.checkpoint import Checkpoints
 
@@ -145,8 +146,8 @@ def reserve(name: str) -> Path:
     raise AssertionError("one of all numbers is free")
 
 
-def newest(root: Path = ROOT) -> Path:
-    """Find the run with the newest checkpoint.
+def newest(root: Path = ROOT, robot: str | None = None) -> Path:
+    """Find the run with the newest checkpoint, of this robot or of any.
 
     Raises:
         ConfigError: no run has one.
@@ -154,8 +155,13 @@ def newest(root: Path = ROOT) -> Path:
     runs = [
         path.parent for path in root.glob("*/checkpoints") if Checkpoints(path).latest() is not None
     ]
+    if robot is not None:
+        runs = [run for run in runs if name_robot(read_config(run).robot.name) == robot]
     if not runs:
-        raise ConfigError(f"no trained run in {root}/; train one with: make train TERRAIN=flat")
+        whose, how = (f" of '{robot}'", f' ARGS="--robot {robot}"') if robot else ("", "")
+        raise ConfigError(
+            f"no trained run{whose} in {root}/; train one with: make train TERRAIN=flat{how}"
+        )
     return max(runs, key=lambda run: (run / "checkpoints").stat().st_mtime)
 
 

@@ -14,7 +14,7 @@ from cref_jax import config, depth, robot, terrain
 from cref_jax.robot import kinematics
 from cref_jax.terrain import lanes
 
-CAMERA = config.Camera()
+CAMERA = robot.fill_in(config.Config()).camera
 HEIGHT, WIDTH = CAMERA.shape
 FAR = 12.0  # m, how far the oracle's boxes continue the border
 NONE = np.zeros((0, 7), np.float32)

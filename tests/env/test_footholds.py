@@ -15,7 +15,7 @@ from cref_jax.env import footholds
 from cref_jax.robot import kinematics
 from cref_jax.terrain import lanes
 
-C = config.Foothold()
+C = robot.fill_in(config.Config()).foothold
 X = 0.12 + 0.04 * np.arange(25)  # m, means of the windows: 24 cm from 0 on, every 4 cm
 ACROSS = 0.007  # m, y of the soles: no point of the buffer lies on the border of two columns
 

@@ -1,6 +1,7 @@
 import dataclasses
 import hashlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from tiny_policy import ROBOT, SMALL, J, policy, recorded
 
-from cref_jax import config, deploy, robot
+from cref_jax import config, deploy, export, play, report, robot, sim2sim
+from cref_jax import eval as eval_command
 from cref_jax.errors import ConfigError
 from cref_jax.policy import reader, reference_vectors, runtime_file, sources, writer
 from cref_jax.policy.manifest import build_manifest
-from cref_jax.robot.x2_ultra import X2_ULTRA
+from cref_jax.robot.registry import describe
 from cref_jax.runtime import network
 
 
@@ -87,16 +89,20 @@ def test_the_manifest_has_the_command_and_no_one_s_folders(tmp_path):
     assert command == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
 
 
-def test_the_manifest_says_what_the_engineer_needs():
-    manifest = build_manifest(policy("full"), ROBOT)
-    assert [joint["name"] for joint in manifest["joints"]] == list(ROBOT.joint_names)
-    whole = robot.load(config.Robot(actuated="all"))
+@pytest.mark.parametrize("name", robot.ROBOTS)
+def test_the_manifest_says_what_the_engineer_needs(name):
+    driven = robot.load(config.Robot(name))
+    manifest = build_manifest(policy("full", name=name), driven)
+    assert manifest["robot"] == name
+    assert [joint["name"] for joint in manifest["joints"]] == list(driven.joint_names)
+    whole = robot.load(config.Robot(name, actuated="all"))
     held = {joint["name"] for joint in manifest["held_joints"]}
-    assert held == set(whole.joint_names) - set(ROBOT.joint_names)
+    assert held == set(whole.joint_names) - set(driven.joint_names)
     assert [term["name"] for term in manifest["observation"]["terms"]] == list(deploy.TERMS)
     assert sum(term["size"] for term in manifest["observation"]["terms"]) == 9 + 3 * J
     assert len(manifest["observation"]["mean"]) == 9 + 3 * J
-    assert manifest["depth"]["mount"]["link"] in X2_ULTRA.xml.read_text()
+    assert f'<body name="{manifest["depth"]["mount"]["link"]}"' in describe(name).xml.read_text()
+    assert manifest["depth"]["mount"]["pitch_deg"] == describe(name).camera_pitch
     assert manifest["rates"] == {"control_hz": 50.0, "depth_hz": 20.0, "frame_age_s": 0.02}
     json.dumps(manifest, allow_nan=False)
 
@@ -119,6 +125,50 @@ def test_without_a_run_the_bundled_policy_is_taken(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert sources.resolve_policy(None, None) == sources.bundled_policy()
     assert not sources.is_run(sources.bundled_policy())
+
+
+def runs_of(root: Path, **robots: str) -> None:
+    """Make a run of one checkpoint for each robot, the later the newer."""
+    for number, (run, robot_name) in enumerate(robots.items()):
+        (root / run / "checkpoints" / "1" / "state").mkdir(parents=True)
+        (root / run / "config.json").write_text(json.dumps({"robot": {"name": robot_name}}))
+        os.utime(root / run / "checkpoints", (number, number))
+
+
+def test_the_newest_run_is_that_of_the_robot(tmp_path, monkeypatch):
+    runs_of(tmp_path / "runs", a="g1", b="g1", c="x2_ultra")
+    monkeypatch.chdir(tmp_path)
+    newest = lambda name: sources.resolve_policy(None, None, name)
+    assert [newest(name) for name in (None, "x2_ultra", "g1")] == [
+        Path("runs/c"), Path("runs/c"), Path("runs/b"),
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match="runs/c is of the robot 'x2_ultra', not of 'g1'"):
+        sources.resolve_policy(Path("runs/c"), None, "g1")
+    with pytest.raises(ConfigError, match="unknown robot 'g2'; did you mean 'g1'"):
+        newest("g2")
+
+
+def test_without_a_run_of_the_robot_its_training_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert sources.resolve_policy(None, None, "x2_ultra") == sources.bundled_policy()
+    with pytest.raises(ConfigError, match=r"no trained run of 'g1' .* ARGS=\"--robot g1\""):
+        sources.resolve_policy(None, None, "g1")
+
+
+@pytest.mark.parametrize("command", [eval_command, play, export, sim2sim, report])
+def test_every_command_refuses_another_robots_policy(command, capsys):
+    given = "--run" if command is export else "--policy"
+    with pytest.raises(SystemExit) as end:
+        command.main([given, str(sources.bundled_policy()), "--robot", "g1"])
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and said.count("\n") == 1
+    assert "is of the robot 'x2_ultra', not of 'g1'" in said
+
+
+def test_a_policy_in_the_world_of_another_robot_is_refused(small_world):
+    c = robot.fill_in(dataclasses.replace(small_world.config, robot=config.Robot("g1")))
+    with pytest.raises(ConfigError, match="is of the robot 'x2_ultra', not of 'g1'"):
+        sources.load(sources.bundled_policy(), small_world.replace(config=c))
 
 
 def test_what_is_no_policy_is_one_line(tmp_path):

@@ -6,6 +6,7 @@ import pytest
 
 from cref_jax import config, robot
 from cref_jax.robot import kinematics
+from cref_jax.robot.registry import ROBOTS
 
 STATES = 50
 
@@ -26,9 +27,10 @@ def mujocos_links(model: mujoco.MjModel, state: mujoco.MjData, bodies: int) -> k
     )
 
 
+@pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("actuated", ["legs", "all"])
-def test_links_are_where_mujoco_has_them_and_move_as_it_says(actuated):
-    model = robot.spec(actuated, config.Physics()).compile()
+def test_links_are_where_mujoco_has_them_and_move_as_it_says(actuated, name):
+    model = robot.spec(actuated, config.Physics(), name=name).compile()
     state, tree, rng = mujoco.MjData(model), kinematics.tree(model), np.random.default_rng(0)
     forward = jax.jit(lambda qpos, qvel: kinematics.links(tree, qpos, qvel))
     for _ in range(STATES):

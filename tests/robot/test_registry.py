@@ -27,4 +27,15 @@ def test_a_setting_that_is_given_stays_and_the_rest_is_the_robots():
     full = robot.fill_in(given)
     assert (full.reward.base_height_target, full.reward.feet_y_target) == (0.5, 0.27)
     assert (full.scan.base_height, full.episode.min_height) == (0.62, 0.15)
+    assert (full.robot.name, full.camera.pitch) == ("x2_ultra", 50.0)
     assert robot.fill_in(full) == full
+
+
+def test_the_robot_that_is_asked_for_comes_before_that_of_the_settings():
+    asked = robot.fill_in(override(Config(), {"robot": {"name": "x2_ultra"}}), "g1")
+    assert (asked.robot.name, asked.camera.pitch) == ("g1", 47.6)
+    # the sole from 5.5 cm behind the ankle to 13 cm ahead of it, 6 cm wide
+    assert (asked.foothold.quality_x, asked.foothold.quality_y) == (
+        (-0.055, 0.13, 5),
+        (-0.03, 0.03, 3),
+    )

@@ -25,9 +25,15 @@ SMALL = config.Network(
 
 
 @functools.cache
-def policy(variant: config.Variant, net: config.Network = SMALL) -> trained.TrainedPolicy:
-    """Return a policy whose every parameter matters, and which has seen observations."""
-    c = dataclasses.replace(Config(), network=dataclasses.replace(net, variant=variant))
+def policy(
+    variant: config.Variant, net: config.Network = SMALL, name: str | None = None
+) -> trained.TrainedPolicy:
+    """Return a policy whose every parameter matters, and which has seen observations.
+
+    It is of the robot `name`, which has legs of J joints as the first one has.
+    """
+    c = robot.fill_in(Config(), name)
+    c = dataclasses.replace(c, network=dataclasses.replace(net, variant=variant))
     actor, carry = network.Actor(c.network, J), network.initial_carry(c.network, 1)
     sight = None
     if variant != "blind":
@@ -53,7 +59,8 @@ def policy(variant: config.Variant, net: config.Network = SMALL) -> trained.Trai
 
 def contents(p: trained.TrainedPolicy) -> tuple[dict, dict[str, np.ndarray]]:
     """Return the manifest without digests, and the weights."""
-    return build_manifest(p, ROBOT), pytree_digest.on_host(p.train.params.actor["params"])
+    driven = robot.load(p.config.robot)
+    return build_manifest(p, driven), pytree_digest.on_host(p.train.params.actor["params"])
 
 
 def recorded(count: int, sees: bool = True, seed: int = 0) -> reference_vectors.SensorLog:

@@ -8,8 +8,9 @@ import pytest
 import small_world
 from small_world import ROBOTS, C, on, one
 
-from cref_jax import config, network
+from cref_jax import config, network, robot
 from cref_jax.env import environment
+from cref_jax.physics.records import Body
 from cref_jax.training import iteration, mirror, rollout
 
 MODEL_NAMES = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -96,6 +97,29 @@ def test_the_simulation_commutes_with_the_mirror(world, robots, joints):
         np.testing.assert_array_equal(feet, real.measures.airborne)
     difference = np.abs(np.asarray(look(world, image))[..., ::-1] - np.asarray(look(world, state)))
     assert np.mean(difference < 0.01) > 0.99  # of the pixels; rounding decides at edges
+
+
+@pytest.mark.parametrize("name", robot.ROBOTS)
+def test_every_robot_is_its_own_mirror_image(name):
+    """Its masses, shapes, motors and limits are: MuJoCo's steps commute with the mirror."""
+    whole = robot.load(config.Robot(name, actuated="all"))
+    model = robot.spec("all", config.Physics(), name=name).compile()
+    joints = mirror.pair_joints(model)
+    rng, state, image = np.random.default_rng(0), mujoco.MjData(model), mujoco.MjData(model)
+    state.qpos[:7] = [0.3, 0.2, whole.standing_height - 0.005, 1.0, 0.02, -0.03, 0.1]
+    state.qpos[7:] = whole.nominal_pose + 0.05 * rng.normal(size=model.nu)
+    state.qvel[:] = 0.3 * rng.normal(size=model.nv)
+    turned = mirror.body(Body(*map(jnp.asarray, (state.qpos, state.qvel, state.qvel))), joints)
+    image.qpos[:], image.qvel[:] = turned.qpos, turned.qvel
+    for _ in range(20):
+        target = whole.nominal_pose + 0.3 * rng.normal(size=model.nu)
+        state.ctrl[:], image.ctrl[:] = target, joints.flip(jnp.asarray(target))
+        mujoco.mj_step(model, state)
+        mujoco.mj_step(model, image)
+    assert state.ncon > 2
+    expected = mirror.body(Body(*map(jnp.asarray, (state.qpos, state.qvel, state.qvel))), joints)
+    np.testing.assert_allclose(image.qpos, expected.qpos, atol=1e-4)
+    np.testing.assert_allclose(image.qvel, expected.qvel, atol=1e-2)
 
 
 def taught():

@@ -6,7 +6,7 @@ from cref_jax.robot.description import Description
 
 X2_ULTRA = Description(
     title="AGIBOT X2 Ultra",
-    xml=Path(__file__).with_suffix(".xml"),
+    xml=Path(__file__).with_name("x2_ultra.xml"),
     nominal_pose={  # assumed: flat feet, and the pelvis at the 0.55 m above the ankles of Table I
         "hip_pitch": -0.42,
         "knee": 0.83,
@@ -31,4 +31,7 @@ X2_ULTRA = Description(
     # assumed: a foot comes down on a box of 40 cm when the pelvis is still 0.3 m above the box
     fallen_below=0.15,
     feet_apart=0.27,  # Table I
+    sole_x=(-0.06, 0.13, 5),
+    sole_y=(-0.05, 0.05, 3),
+    camera_pitch=50.0,  # Sec. III-A
 )
