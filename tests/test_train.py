@@ -176,7 +176,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
             ["--coordinator", "a:1", "--num-processes", "2", "--process-id", "2"],
             "--process-id must be 0 to 1, not 2",
         ),
-        (["--robot", "g2"], "unknown robot 'g2'; did you mean 'g1'?"),
+        (["--robot", "g2"], "unknown robot 'g2'; known: g1, x2_ultra"),
         (["--robot", "g1", "--init", BUNDLED], "is of the robot 'x2_ultra', not of 'g1'"),
         (["--init", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
         (

@@ -88,7 +88,10 @@ def proprioception(obs: Float[Array, "*n O"], of: JointPairs) -> Float[Array, "*
 def frame(
     frames: Float16[Array, "*n rows columns pixels"], c: config.Network
 ) -> Float16[Array, "*n rows columns pixels"]:
-    """Mirror depth frames, keeping the network's patch order."""
+    """Mirror depth frames, keeping the network's patch order.
+
+    A camera that is not in the robot's middle is taken to be as far on the other side.
+    """
     return network.image_to_patches(c, jnp.flip(network.patches_to_image(c, frames), axis=-1))
 
 
