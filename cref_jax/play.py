@@ -138,6 +138,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 def play(options: Options) -> None:
     """Simulate, film and summarise one episode."""
+    if options.scene:
+        raise ConfigError("--scene goes with --live; eval --suite ood --film films one")
     is_trained = options.agent == "trained"
     choose = lambda: sources.resolve_policy(options.run, options.policy, options.robot)
     source = choose() if is_trained or options.run else None
@@ -171,6 +173,8 @@ def drive(options: Options) -> None:
     """Serve the page on which people drive the robot, until Ctrl-C."""
     if options.agent != "trained" or options.stills or options.out:
         raise ConfigError("--live goes without --agent, --stills and --out")
+    if options.scene and (options.terrain or options.kind or options.level is not None):
+        raise ConfigError("--scene goes without --terrain, --kind and --level")
     source = sources.resolve_policy(options.run, options.policy)
     c = sources.read_config(source)
     terrain = options.terrain or c.terrain.name

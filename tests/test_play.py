@@ -51,6 +51,8 @@ def refused(capsys, *arguments):
         (["--out", "film.mp4", "--stills", "3"], "--out must end in .png"),
         (["--out", "file/film.mp4"], "cannot make the folder file"),
         (["--out", "folder.mp4"], "cannot write folder.mp4"),
+        (["--live"], "--live goes without --agent"),
+        (["--scene", "curbs"], "--scene goes with --live"),
     ],
 )
 def test_a_mistake_is_one_line(capsys, monkeypatch, tmp_path, arguments, said):
@@ -58,6 +60,19 @@ def test_a_mistake_is_one_line(capsys, monkeypatch, tmp_path, arguments, said):
     (tmp_path / "file").touch()
     (tmp_path / "folder.mp4").mkdir()
     assert said in refused(capsys, "--agent", "stand", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--scene", "curb"], "did you mean 'curbs'?"),
+        (["--scene", "curbs", "--kind", "gap"], "--scene goes without --terrain, --kind"),
+        (["--scene", "curbs", "--port", "0"], "--port must be 1 to 65535"),
+        (["--policy", "robst"], "no run or policy robst"),
+    ],
+)
+def test_a_mistake_of_a_live_page_is_one_line(capsys, arguments, said):
+    assert said in refused(capsys, "--policy", "robust", "--live", *arguments)
 
 
 def test_what_is_no_policy_is_refused(capsys, monkeypatch, tmp_path):

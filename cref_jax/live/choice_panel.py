@@ -48,7 +48,7 @@ class ChoicePanel:
                 stage = find(self._session.view().stage)
                 self._session.begin(stage)
                 self._on_changed(stage)
-            except (ConfigError, CheckpointError) as error:
+            except (ConfigError, CheckpointError, OSError) as error:
                 self.complain(str(error))
             finally:
                 self._busy.visible = False

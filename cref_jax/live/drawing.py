@@ -138,9 +138,9 @@ class Drawing:
         self._scene.set_background_image(np.tile(np.uint8(SKY), (2, 2, 1)))
         self._scene.configure_fog(9.0, 26.0, color=SKY)
         self._scene.configure_default_lights(False)  # several maps of shadows: slow without a GPU
-        self._scene.add_light_ambient("/light/sky", intensity=1.5)
+        self._scene.add_light_ambient("/light/sky", intensity=1.1)
         self._scene.add_light_directional(
-            "/light/sun", intensity=2.2, cast_shadow=True, position=(-1.5, -2.5, 4.0)
+            "/light/sun", intensity=1.7, cast_shadow=True, position=(-1.5, -2.5, 4.0)
         )
 
 

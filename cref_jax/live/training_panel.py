@@ -22,8 +22,8 @@ MOST_POINTS = 300  # per curve
 WINDOW = 20  # iterations that a point is the mean of
 HEIGHT = 170  # pixels of a chart
 CURVES = {  # column of the log: title and colour
-    "episode/length_s": ("episode length, s", "#1d4e80"),
-    "walk/speed_error": ("speed error, m/s", "#b5432a"),
+    "episode/length_s": ("episode length, s, by M samples", "#1d4e80"),
+    "walk/speed_error": ("speed error, m/s, by M samples", "#b5432a"),
 }
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from cref_jax.errors import ConfigError
-from cref_jax.live import server
+from cref_jax.live import drive_panel, server
 from cref_jax.live.server import Settings
+from cref_jax.live.session import Wish
 from cref_jax.live.stage import Place
 
 CURBS = Settings(Path("robust"), Place(scene="curbs"))
@@ -46,6 +47,42 @@ def test_it_goes_on_drawing(page):
     page[0]._draw(1)
     assert page[2].is_alive() and page[0].clock.failure is None
     assert page[0].clock.share > 0.0
+
+
+def test_another_scene_and_policy_are_taken_without_a_restart(page):
+    choice, session = page[0]._choice, page[0]._session
+    choice._kind.value, choice._scene.value = "scene", "planks"
+    choice._go_there()
+    choice._take("mixed")
+    view = session.view()
+    assert (view.stage.place.scene, view.stage.policy.name) == ("planks", "mixed")
+    page[0]._draw(0)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"), [("mixd", "no run or policy mixd"), ("pyproject.toml", "pyproject.toml")]
+)
+def test_a_policy_that_there_is_not_is_said_and_the_robot_walks_on(
+    page, monkeypatch, source, message
+):
+    said, before = [], page[0]._session.view().stage
+    monkeypatch.setattr(page[0]._choice, "complain", said.append)
+    page[0]._choice._take(source)
+    assert len(said) == 1 and message in said[0] and "\n" not in said[0]
+    assert page[0]._session.view().stage is before
+
+
+def test_keys_change_what_is_asked_within_its_limits(page):
+    """From 0.9 m/s, four presses of 0.05 end at the limit of 1 m/s; turning leaves the lane."""
+    drive, session = page[0]._drive, page[0]._session
+    session.drive(Wish(vx=0.9))
+    for _ in range(4):
+        drive._change(drive_panel.FORWARD_STEP, 0.0)
+    assert session.wish == Wish(vx=1.0)
+    drive._change(0.0, drive_panel.TURN_STEP)
+    assert session.wish == Wish(vx=1.0, yaw_rate=0.1, keep_lane=False)
+    drive.refresh()
+    assert (drive._forward.value, drive._turn.value, drive._lane.value) == (1.0, 0.1, False)
 
 
 def test_it_is_not_to_be_reached_from_elsewhere(page):
