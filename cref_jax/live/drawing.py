@@ -19,6 +19,7 @@ from cref_jax.live.matte import make_matte
 from cref_jax.live.session import View
 from cref_jax.live.stage import Stage
 from cref_jax.rendering.robot_scene import MARKS
+from cref_jax.whole_body.ground import Lane
 
 FOLLOW = 0.4  # s, in which the camera catches up with the robot
 CALM = 0.6  # s, the same upwards
@@ -27,6 +28,7 @@ DISC = 0.035  # m, radius of a touchdown's mark
 DOT = 0.02  # m, size of a candidate's mark
 ABOVE = np.array([0.0, 0.0, 0.006])  # m, marks above the ground
 AWAY = np.array([0.0, 0.0, -1000.0])  # m, where marks without a place are
+BESIDE, BEHIND = (-2.3, -2.6, 1.0), (-3.3, -0.9, 1.5)  # m, of a viewer; a scene may have walls
 SKY = (226, 232, 239)
 SHADOW = 0.35  # darkness of shadows on the ground
 GAMMA = 2.2  # of a lit surface's colour, which is linear
@@ -80,6 +82,8 @@ class Drawing:
         self._scene.add_mesh_trimesh(
             "/world/ground", mesh, cast_shadow=False, receive_shadow=SHADOW
         )
+        is_lane = isinstance(stage.ground, Lane)
+        self._server.initial_camera.position = BESIDE if is_lane else BEHIND
         self._search = FootholdSearch.on(stage)
         self._dots.points = np.tile(AWAY, (2, 1)).astype(np.float32)
         if self._stage is None or self._stage.policy.config.robot != stage.policy.config.robot:
@@ -118,7 +122,12 @@ class Drawing:
         c = stage.body.config
         model = robot.spec("all", c.physics, 0, visual=True, name=c.robot.name).compile()
         return [
-            _Body(self._scene.add_mesh_trimesh(f"/world/robot/{body}", make_matte(mesh)), body)
+            _Body(
+                self._scene.add_mesh_trimesh(
+                    f"/world/robot/{body}", make_matte(mesh, is_smooth=True)
+                ),
+                body,
+            )
             for body, mesh in robot_mesh.build_links(model).items()
         ]
 
@@ -133,8 +142,8 @@ class Drawing:
     def _set_light(self) -> None:
         """Set sky, haze, light and the view that a new viewer begins with."""
         camera = self._server.initial_camera
-        camera.position, camera.look_at = (-2.3, -2.6, 1.0), (0.35, 0.0, -0.12)
-        camera.fov = np.deg2rad(45.0)
+        camera.position, camera.look_at = BESIDE, (0.35, 0.0, -0.12)
+        camera.fov, camera.near = np.deg2rad(45.0), 0.1
         self._scene.set_background_image(np.tile(np.uint8(SKY), (2, 2, 1)))
         self._scene.configure_fog(9.0, 26.0, color=SKY)
         self._scene.configure_default_lights(False)  # several maps of shadows: slow without a GPU

@@ -18,7 +18,7 @@ def build_links(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
 
 
 def _build_part(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """Build the mesh of a geom in its body's frame; round ones have smooth normals."""
+    """Build the mesh of a geom in its body's frame; faces share vertices where it is round."""
     size, create = model.geom_size[geom], trimesh.creation
     match model.geom_type[geom]:
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
@@ -36,7 +36,5 @@ def _build_part(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
     mesh.apply_transform(pose)
     colour = np.round(255.0 * model.geom_rgba[geom]).astype(np.uint8)
-    return trimesh.Trimesh(
-        mesh.vertices, mesh.faces, vertex_normals=mesh.vertex_normals,
-        vertex_colors=np.tile(colour, (len(mesh.vertices), 1)), process=False,
-    )  # fmt: skip
+    colours = np.tile(colour, (len(mesh.vertices), 1))
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)

@@ -45,7 +45,11 @@ class SightPanel:
             "Turn": f"{view.yaw_rate:.2f} of {turn:.2f} rad/s",
             "Time": f"{view.seconds:.2f} s, {_describe_pace(clock)}",
             "Runtime": view.why or "all is well",
-            "Robot": str(clock.failure or view.note or ("stands" if view.is_stopped else "walks")),
+            "Robot": str(
+                clock.failure
+                or view.note
+                or ("told to stand" if view.is_stopped else "on its feet")
+            ),
         }
         said = "".join(ROW.format(key, html.escape(value)) for key, value in rows.items())
         said = TABLE.format(said) + _legend()
