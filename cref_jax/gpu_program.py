@@ -1,4 +1,4 @@
-"""The training program for an NVIDIA GPU, compiled on a machine without one.
+"""Compile the training program for an NVIDIA GPU on a machine without one.
 
     python -m cref_jax.gpu_program --gpu h100
 

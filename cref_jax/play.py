@@ -91,7 +91,7 @@ class Options(cli.PolicyOptions):
     """with --live: a scene of `eval --suite ood`, such as curbs, instead of a lane"""
     host: str = "127.0.0.1"
     """address that the page listens on; the default is this machine alone"""
-    port: int = 8080
+    port: Annotated[int, Within(1, 65535)] = 8080
     """port of the page; if it is taken, the next free one"""
 
 

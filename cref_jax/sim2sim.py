@@ -1,4 +1,4 @@
-"""An exported policy on the whole robot: `python -m cref_jax.sim2sim --policy policy/`."""
+"""Run an exported policy on the whole robot: `python -m cref_jax.sim2sim --policy policy/`."""
 
 import cref_jax.system.startup  # noqa: F401
 

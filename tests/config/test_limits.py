@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from cref_jax import config
+from cref_jax import config, robot
 from cref_jax.config import Config, folders, limits, presets
 from cref_jax.config.ranges import Rising, Samples, Within, check_ranges
 from cref_jax.errors import ConfigError
@@ -55,7 +55,7 @@ def with_value(c: Any, path: tuple[str, ...], value: Any) -> Any:
 
 
 def default_of(path: tuple[str, ...]) -> Any:
-    value: Any = Config()
+    value: Any = robot.fill_in(Config())
     for name in path:
         value = getattr(value, name)
     return value
