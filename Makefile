@@ -48,6 +48,9 @@ gpu-program: $(READY)  ## compile the training program for a GPU, without one: A
 params: $(READY)  ## count the parameters of each variant of the network
 	$(BIN)/python -m cref_jax.params $(ARGS)
 
+doctor: $(READY)  ## check this machine, and say what to do
+	$(BIN)/python -m cref_jax.doctor $(ARGS)
+
 test: $(READY)  ## run every test: ARGS="-k depth"
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 

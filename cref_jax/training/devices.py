@@ -52,7 +52,7 @@ def check_memory(program: jax.stages.Compiled, num_envs: int, devices: int = 1) 
     needed = m.argument_size_in_bytes + m.temp_size_in_bytes
     needed += m.output_size_in_bytes - m.alias_size_in_bytes
     stats = jax.local_devices()[0].memory_stats()  # None on a CPU
-    available = stats["bytes_limit"] if stats else _main_memory()
+    available = stats["bytes_limit"] if stats else main_memory()
     held = 0 if stats else _resident_memory()
     needed *= 1 if stats else devices
     if held + needed > available:
@@ -75,7 +75,7 @@ def _resident_memory() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def _main_memory() -> int:
+def main_memory() -> int:
     """Read the memory that this process may use, bytes: the machine's, or its container's."""
     sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     for file in CONTAINER_LIMITS:

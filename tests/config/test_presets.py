@@ -27,7 +27,7 @@ def program(arguments, temporary, output=0, alias=0):
 
 
 def test_memory_is_what_goes_in_what_comes_out_and_what_lies_between(monkeypatch):
-    monkeypatch.setattr(devices, "_main_memory", lambda: 64 * GIB)
+    monkeypatch.setattr(devices, "main_memory", lambda: 64 * GIB)
     monkeypatch.setattr(devices, "_resident_memory", lambda: 2 * GIB)
     # the output takes the place of the state that went in; the process holds 2 GiB without it
     two = program(2 * GIB, 5 * GIB, 3 * GIB, 2 * GIB)
@@ -45,7 +45,7 @@ def test_what_the_process_holds_is_what_it_took():
 
 
 def test_too_many_robots_are_refused_with_a_number_that_fits(monkeypatch):
-    monkeypatch.setattr(devices, "_main_memory", lambda: 8 * GIB)
+    monkeypatch.setattr(devices, "main_memory", lambda: 8 * GIB)
     monkeypatch.setattr(devices, "_resident_memory", lambda: 2 * GIB)
     # 4096 x (8 - 2) / 8 = 3072 would fit; the power of two below it is 2048
     with pytest.raises(ConfigError, match=r"need 10.0 GiB and the device has 8.0; .* 2048"):
