@@ -72,7 +72,7 @@ clean:  ## remove .venv and caches; runs/ stays
 
 # The first Python from 3.11 to 3.14; PYTHON=/path/to/python overrides the search.
 # CUDA 13 needs driver 580 or newer.
-$(READY): pyproject.toml $(wildcard constraints-*.txt)
+$(READY): pyproject.toml $(wildcard constraints/*.txt)
 	@set -eu; python=""; \
 	for candidate in $(or $(PYTHON),python3.12 python3.13 python3.11 python3); do \
 	  if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' \
@@ -89,7 +89,7 @@ $(READY): pyproject.toml $(wildcard constraints-*.txt)
 	if [[ "$$driver" =~ ^[0-9]+$$ ]]; then \
 	  if (( driver >= 580 )); then extras=$$extras,warp,cuda13; else extras=$$extras,warp,cuda12; fi; \
 	fi; \
-	tested=constraints-py$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])').txt; \
+	tested=constraints/py$$($(BIN)/python -c 'import sys; print("%d%d" % sys.version_info[:2])').txt; \
 	echo "installing cref-jax[$$extras] into $(VENV) (a few minutes the first time)"; \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$$extras]" \
 	  $$([ -f "$$tested" ] && echo "--constraint $$tested"); \

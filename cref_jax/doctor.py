@@ -106,8 +106,8 @@ def check_packages() -> Iterator[Finding]:
 
 def _read_tested() -> dict[str, str]:
     """Read the versions that were tested with this Python, by name; nothing if none was."""
-    name = f"constraints-py{sys.version_info.major}{sys.version_info.minor}.txt"
-    file = folders.data_folder(name)
+    name = f"py{sys.version_info.major}{sys.version_info.minor}.txt"
+    file = folders.data_folder("constraints") / name
     lines = file.read_text().splitlines() if file.is_file() else ()
     pairs = (line.split("==") for line in lines if "==" in line and not line.startswith("#"))
     return {package.strip().lower(): version.split()[0] for package, version in pairs}

@@ -24,7 +24,7 @@ pack() {
   [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
   for name in $PACKAGES; do
     version=$({ $pip show "$name" 2>/dev/null || true; } | awk '/^Version:/ { print $2 }')
-    : "${version:=$(sed -n "s/^$name==//p" "$root/constraints-py${python/./}.txt" 2>/dev/null)}"
+    : "${version:=$(sed -n "s/^$name==//p" "$root/constraints/py${python/./}.txt" 2>/dev/null)}"
     wanted+=("$name${version:+==$version}")
   done
   mkdir -p "$folder"

@@ -6,9 +6,9 @@ PACKAGE = Path(__file__).parents[1]
 
 
 def data_folder(name: str) -> Path:
-    """Find `experiments`, `policies`, `terrains` or a file of tested versions.
+    """Find `constraints`, `experiments`, `policies` or `terrains`.
 
     They are inside an installed package, or beside it.
     """
     inside = PACKAGE / name
-    return inside if inside.exists() else PACKAGE.parent / name
+    return inside if inside.is_dir() else PACKAGE.parent / name
