@@ -13,6 +13,7 @@ from cref_jax.deploy import Status
 from cref_jax.policy import c_files
 from cref_jax.runtime.camera import Camera
 from cref_jax.runtime.cross_checks import CrossChecks
+from cref_jax.runtime.nudge import Nudge
 
 DRIVER = Path(__file__).parent / "policy_driver.c"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -138,7 +139,7 @@ class Both:
 
 
 def leave_out_cross_checks(monkeypatch) -> None:
-    """Let the runtime in numpy not compare the senses, as C does not."""
+    """Let the runtime in numpy neither compare the senses nor swing the hips, as C does not."""
     compare = CrossChecks.compare
 
     def count_only(self, *senses, forget=False) -> Status:
@@ -146,6 +147,8 @@ def leave_out_cross_checks(monkeypatch) -> None:
         return Status.OK
 
     monkeypatch.setattr(CrossChecks, "compare", count_only)
+    monkeypatch.setattr(Nudge, "offset", lambda self: np.float32(0.0))
+    monkeypatch.setattr(Nudge, "judge", lambda self: deploy.Status.OK)
     monkeypatch.setattr(Camera, "_compare_tilts", lambda self, seen, gravity: Status.OK)
 
 
