@@ -128,7 +128,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     options = dataclasses.replace(options, device=select_device(options.device))
     resumed = (options.run_dir or run_dir.newest()) if options.resume else None
     if resumed:
-        base = run_dir.read_config(resumed)
+        base = fill_in(run_dir.read_config(resumed))
         resumption.check_origin(resumed, base, arguments, options.terrain, options.experiment)
         run_dir.check_map(resumed, base.terrain.name)
         options = dataclasses.replace(options, run_dir=resumed)
@@ -280,7 +280,7 @@ def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[s
         return [headline, f"begins as {sources.summarize(options.init)}"]
     if not options.resume:
         return [headline]
-    own, last = run_dir.read_config(run), run_dir.last_engine(run)
+    own, last = fill_in(run_dir.read_config(run)), run_dir.last_engine(run)
     lines = [headline, *resumption.describe_changes(own, c)]
     if last not in (None, engine):
         lines.append(f"engine changes from {last} to {engine}: not bit for bit from here on")
