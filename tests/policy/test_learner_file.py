@@ -44,7 +44,7 @@ def test_a_policy_is_summarized_as_it_is_described(small, tmp_path):
     learner_file.write(policy, policy.run)
     assert sources.summarize(policy.run) == sources.describe(policy.run, policy)
     bundled = sources.bundled_policy()
-    expected = f"{bundled}: network full, trained on mixed for 86.0 M samples"
+    expected = f"{bundled}: x2_ultra, network full, trained on mixed for 86.0 M samples"
     assert sources.summarize(bundled) == expected
 
 
