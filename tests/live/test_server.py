@@ -122,8 +122,9 @@ def test_it_says_how_to_reach_it_from_another_machine(monkeypatch):
 def test_ctrl_c_ends_it_quietly():
     words = f"-m cref_jax.play --live --policy robust --scene curbs --port {free_port()}"
     command = [sys.executable, *words.split()]
+    heed = lambda: signal.signal(signal.SIGINT, signal.default_int_handler)  # not so behind nohup
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed
     ) as live:
         assert live.stdout
         assert live.stdout.readline().startswith("open http://127.0.0.1:")
