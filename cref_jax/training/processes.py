@@ -20,7 +20,7 @@ from orbax.checkpoint import multihost
 from cref_jax.errors import ConfigError
 
 LONGEST_WAIT = 3600.0  # s; assumed: compiling on busy cores takes minutes
-PATIENCE = 30  # s without a sign of life until a process counts as lost; assumed
+PATIENCE = 45  # s without a sign of life until a process counts as lost; an exchange waits for 30
 
 _barriers = itertools.count()  # each has a name of its own, the same in all processes
 
