@@ -108,7 +108,7 @@ def _flushed() -> Iterator[None]:
 
 
 def _one_line(error: Exception) -> str:
-    """Return what an error says; what the system refuses comes with the file that it is about."""
+    """Write an error as one line; what the system refuses comes with the file that it is about."""
     message = str(error)
     if isinstance(error, OSError) and error.strerror is not None:
         file = f"{error.filename}: " if error.filename else ""
