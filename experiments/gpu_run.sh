@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
 # Train on a GPU machine that is at hand for minutes and has no network, but Python and JAX for CUDA.
 #
-#   experiments/gpu_run.sh pack FOLDER [--python 3.12]
-#       here: this project as a wheel, and what such a machine has not, for x86-64
+#   experiments/gpu_run.sh pack FOLDER [--python 3.12] [-- TRAINING OPTIONS]
+#       here: this project as a wheel, and what such a machine has not, for x86-64; with training options
+#       also the kernels that MuJoCo Warp would otherwise compile there for a minute
 #   FOLDER/gpu_run.sh run OUT [--minutes 9] [--mib 16] [--from LEARNED.npz] -- TRAINING OPTIONS
 #       there: install that apart, train until a minute before the end, and write to OUT the log and
 #       learned.npz, from which the next call goes on; no file there is above 16 MiB
@@ -18,10 +19,13 @@ fail() { echo "error: $*" >&2; exit 2; }
 
 pack() {
   local folder=${1:?pack needs a folder} python=3.12 root wanted=() version
-  [ "${2:-}" = "--python" ] && python=${3:?--python needs a version}
+  shift
+  [ "${1:-}" = "--python" ] && { python=${2:?--python needs a version}; shift 2; }
   root=$(cd "$here/.." && pwd)
   local pip="$root/.venv/bin/python -m pip --disable-pip-version-check"
   [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
+  [ "${1:-}" != "--" ] || $root/.venv/bin/python -c "import warp" 2>/dev/null ||
+    fail "kernels are compiled by MuJoCo Warp, which is not here: pip install 'cref-jax[warp]'"
   for name in $PACKAGES; do
     version=$({ $pip show "$name" 2>/dev/null || true; } | awk '/^Version:/ { print $2 }')
     : "${version:=$(sed -n "s/^$name==//p" "$root/constraints/py${python/./}.txt" 2>/dev/null)}"
@@ -33,6 +37,10 @@ pack() {
     --implementation cp --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
     --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 --dest "$folder" "${wanted[@]}"
   cp "$here/gpu_run.sh" "$folder/"
+  if [ "${1:-}" = "--" ]; then
+    shift
+    WARP_CACHE_PATH="$folder/cache/warp" "$root/.venv/bin/python" "$here/warp_kernels.py" "$@"
+  fi
   du -sh "$folder"
 }
 
@@ -73,5 +81,5 @@ run() {
 
 case ${1:-} in
   pack | run) "$@" ;;
-  *) sed -n '2,11s/^# \{0,1\}//p' "$0"; exit 2 ;;
+  *) sed -n '2,12s/^# \{0,1\}//p' "$0"; exit 2 ;;
 esac
