@@ -17,7 +17,7 @@ class FilmPanel:
     def __init__(
         self, server: viser.ViserServer, session: Session, complain: Callable[[str], None]
     ) -> None:
-        self._session, self._complain = session, complain
+        self._server, self._session, self._complain = server, session, complain
         with server.gui.add_folder("Film"):
             self._button = server.gui.add_button(
                 "Film", hint=f"simulated time, {film.MOST_SECONDS:g} s at most"
@@ -43,7 +43,7 @@ class FilmPanel:
         try:
             film.write_film(out, taken)
             self._said.content = f"wrote {out}"
-            if viewer:
+            if viewer and viewer.client_id in self._server.get_clients():  # may have left
                 viewer.send_file_download(out.name, out.read_bytes())
         except (ConfigError, OSError) as error:
             self._said.visible = False
