@@ -25,6 +25,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.evaluation import (
     command_suite,
     crossing,
+    failure_films,
     paper_results,
     robustness_suite,
     scene_results,
@@ -32,6 +33,7 @@ from cref_jax.evaluation import (
     tables,
     walking,
 )
+from cref_jax.evaluation.witness import Witness
 from cref_jax.pages import evaluation_page
 from cref_jax.physics.records import EngineName
 from cref_jax.policy import reader, sources, trained, writer
@@ -70,6 +72,9 @@ class Options(cli.DebugOption):
     """trials per scene under each condition: lost, late and partly blind frames, friction"""
     film: str | None = None
     """film one trial in this scene instead of evaluating in all: SCENE.mp4"""
+    films: Annotated[int, Within(0, 20)] = 3
+    """films of failures, one for each of the N cells with the most, in the suites table, robust and
+    cross: a few seconds each; 0 for none"""
     seed: Annotated[int, limits.SEED] = 0
     """seed of initial states and commands"""
     engine: EngineName = "auto"
@@ -94,8 +99,8 @@ def main(arguments: list[str] | None = None) -> None:
         paths = _resolve_sources(options)
         trained_on = [sources.read_config(path).terrain.name for path in paths]
         suite = options.suite or _suite_for(trained_on)
-        options = dataclasses.replace(options, suite=suite)
         out = options.out or (paths[0] if sources.is_run(paths[0]) else Path())
+        options = dataclasses.replace(options, suite=suite, out=out)
         cli.prepare_output(out / "eval.json", ".json")
         subjects = [_subject(path, options) for path in paths]
         if options.film:
@@ -156,17 +161,20 @@ def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Evaluate in all cells of Table II."""
     console, count = Console(), _trials_per_cell(options)
     console.print(f"{tables.interval_note(count * len(subjects))}\n{tables.RULE}", highlight=False)
-    judged = []
+    judged, witness = [], Witness()  # of the first policy
     with _progress(console, 12 * count * len(subjects)) as ended:
         for subject in subjects:
+            train = subject.policy.train
             w = tables.cell_world(subject.policy.config, subject.world.physics)
-            judged.append(tables.run_cells(w, subject.policy.train, count, options.seed, ended))
+            see = None if judged else witness
+            judged.append(tables.run_cells(w, train, count, options.seed, ended, see))
     rows = tables.cell_rows(judged)
     whole = tables.overall(rows)
     console.print(tables.to_table(rows, whole))
     console.print("* beyond chance: 0 is not in the 95 % interval of the difference")
     console.print(tables.failure_lines(rows), highlight=False)
-    return {"rule": tables.RULE, "cells": rows, "overall": whole}
+    seen = _pictures(witness, options)
+    return {"rule": tables.RULE, "cells": rows, "overall": whole, **seen}
 
 
 def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
@@ -174,13 +182,17 @@ def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
     console, count, policy = Console(), _trials_per_cell(options), subjects[0].policy
     w = robustness_suite.row_world(policy.config, subjects[0].world.physics)
     with _progress(console, len(robustness_suite.list_rows()) * count) as ended:
-        found = robustness_suite.run_rows(w, policy.train, count, options.seed, ended)
+        witness = Witness()
+        found = robustness_suite.run_rows(
+            w, policy.train, count, options.seed, ended, witness=witness
+        )
     console.print(robustness_suite.to_table(found))
     console.print(robustness_suite.parts_table(found))
     whole = [row for row in found if row["part"] == robustness_suite.EVERYTHING]
     parts = [row for row in found if row["part"] != robustness_suite.EVERYTHING]
     overall = robustness_suite.overall(found)
-    return {"rule": tables.RULE, "cells": whole, "overall": overall, "parts": parts}
+    seen = _pictures(witness, options)
+    return {"rule": tables.RULE, "cells": whole, "overall": overall, "parts": parts, **seen}
 
 
 def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:
@@ -211,14 +223,14 @@ def _export_subject(subject: Subject) -> Iterator[Path]:
 
 
 def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    subject, count = subjects[0], _trials_per_cell(options)
+    subject, count, witness = subjects[0], _trials_per_cell(options), Witness()
     with _progress(Console(), count) as ended:
         result = crossing.cross(
             subject.policy.config, subject.world.physics, subject.policy.train, options.kind,
-            options.size, count, options.seed, ended,
+            options.size, count, options.seed, ended, witness=witness,
         )  # fmt: skip
     print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
-    return result._asdict()
+    return result._asdict() | _pictures(witness, options)
 
 
 def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
@@ -228,6 +240,15 @@ def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
     result = walking.walk(policy.config, physics, policy.train, count, options.seed)
     print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
     return result._asdict()
+
+
+def _pictures(witness: Witness, options: Options) -> dict[str, Any]:
+    """Collect what the page draws of the trials, and film failures."""
+    folder = (options.out or Path()) / f"failures_{options.suite}"
+    films = failure_films.write(witness.world, witness.worst(options.films), folder)
+    for line in dict.fromkeys(failure_films.describe(row, folder.parent) for row in films):
+        print(line)
+    return witness.record() | {"films": films}
 
 
 def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:

@@ -8,11 +8,12 @@ and footholds_on_stairs.csv (one row per touchdown). 64 robots take one to two m
 
 Half the robots walk a flight up, half a flight down: hard stairs, 20 cm rise, 30 cm tread
 (terrains/flight.toml).
-A touchdown is a contact of either foot with a tread, after at least AIR in the air, of a robot that
-has not failed. Its position is that of the sole's centre, from the tread's nosing (0) towards its
-riser (30 cm), in ascent and in descent. MAD is the median absolute deviation from the median. d_xz
-is the distance used by the foothold reward: that to the nearest candidate frozen at liftoff, in the
-x-z plane; undefined if no window was accepted.
+A touchdown is a contact of either foot with a tread, after at least 0.06 s in the air, of a robot
+that has not failed; cref_jax/evaluation/touchdowns.py has its numbers. Its position is that of the
+sole's centre, from the tread's nosing (0) towards its riser (30 cm), in ascent and in descent. MAD
+is the median absolute deviation from the median. d_xz is the distance used by the foothold reward:
+that to the nearest candidate frozen at liftoff, in the x-z plane; undefined if no window was
+accepted.
 
 A riser collision begins when a contact sphere touches a riser that faces the robot, or its nosing:
 the nearest surface is closer than the sphere's radius, and its normal points back along the lane
@@ -45,7 +46,7 @@ from cref_jax import cli, terrain
 from cref_jax.env import footholds
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.evaluation import protocol, recorder
+from cref_jax.evaluation import protocol, recorder, touchdowns
 from cref_jax.evaluation.recorder import Moment, StepRecords
 from cref_jax.policy import sources
 from cref_jax.robot import kinematics
@@ -54,11 +55,7 @@ from cref_jax.terrain import cross_section, lanes
 
 KINDS = ("ascent", "descent")  # lanes of one flight each
 TREAD = 0.30  # m, terrains/flight.toml
-AIR = 0.06  # s; assumed: three control steps; a shorter time is a rocking foot
-REACH = 0.1  # m, half a sole
-TILT = 0.05  # m, largest height of the sole's centre above a tread; assumed: tilted by 30 degrees
 FACING = -0.7  # largest x of a riser's normal: within 45 degrees of -x
-BIN = 0.01  # m
 PAPER = {"ours": 1.4, "FCQR": 2.8, "NoFR": 9.8}  # cm, MAD in descent, Sec. III-B
 NONE = "no touchdown"
 WAYS = {cross_section.UP: "ascent", cross_section.DOWN: "descent"}
@@ -118,7 +115,7 @@ class FlightStats(NamedTuple):
         nearest = 100 * np.median(self.distance)
         return (
             f"{text}, median {100 * np.median(self.position):.1f} cm, "
-            f"MAD {100 * median_absolute_deviation(self.position):.1f} cm, median d_xz "
+            f"MAD {100 * touchdowns.median_absolute_deviation(self.position):.1f} cm, median d_xz "
             + (f"{nearest:.1f} cm" if np.isfinite(nearest) else "undefined: half had no candidate")
         )
 
@@ -222,14 +219,16 @@ def summarize(world: World, watched: StepRecords) -> dict[int, FlightStats]:
     """Summarise touchdowns and riser collisions for each direction."""
     alive, seen = watched.alive, watched.seen
     period = world.config.physics.control_period
-    t, robot, foot = np.nonzero(seen.touchdown & alive[..., None] & (seen.air_time >= AIR))
+    t, robot, foot = np.nonzero(
+        seen.touchdown & alive[..., None] & (seen.air_time >= touchdowns.AIR)
+    )
     sole = seen.sole[t, robot, foot]
     flight, position = np.zeros(len(t), int), np.zeros(len(t))
     lane, levels = recorder.round_robin_lanes(world.lanes, alive.shape[1])
     onto, over = np.zeros_like(alive), np.zeros_like(alive)
     for e, (kind, level) in enumerate(zip(lane, levels, strict=True)):
         stairs, own = cross_section.from_lane(world.lanes.tile(level, kind)), robot == e
-        place = cross_section.place_on_treads(stairs, sole[own, 0], sole[own, 2], REACH, TILT)
+        place = touchdowns.place(stairs, sole[own, 0], sole[own, 2])
         flight[own], position[own] = place.flight, place.position
         treads, x = np.flatnonzero(stairs.flight), seen.base_x[:, e]
         onto[:, e] = alive[:, e] & (x > stairs.left[treads[0]])
@@ -255,11 +254,6 @@ def summarize(world: World, watched: StepRecords) -> dict[int, FlightStats]:
             collided=int((foot_hits | shank_hits)[:, on_lane].any(axis=(0, 2)).sum()),
         )
     return stats
-
-
-def median_absolute_deviation(x: Float[np.ndarray, " n"]) -> float:
-    """Compute the median absolute deviation from the median."""
-    return float(np.median(np.abs(x - np.median(x))))
 
 
 def make_rows(results: dict[str, dict[int, FlightStats]]) -> Iterator[tuple]:
@@ -296,7 +290,7 @@ def draw(out: Path, results: dict[str, dict[int, FlightStats]], options: Options
 
 def draw_histogram(axis: Axes, stats: FlightStats, colour: str) -> None:
     """Draw the distribution of touchdowns between nosing and riser."""
-    edges = np.arange(-10.0, 100 * TREAD + 10.5, 100 * BIN)
+    edges = 100 * touchdowns.bin_edges(TREAD)
     for x in (0.0, 100 * TREAD):
         axis.axvline(x, color="0.5", lw=0.8, ls="--")
     axis.set(xlim=(edges[0], edges[-1]), ylabel="share of touchdowns")
@@ -306,7 +300,7 @@ def draw_histogram(axis: Axes, stats: FlightStats, colour: str) -> None:
         axis.hist(100 * stats.position, edges, weights=weights, color=colour, alpha=0.8)
         notes += [
             f"{len(stats.position)} touchdowns",
-            f"MAD {100 * median_absolute_deviation(stats.position):.1f} cm",
+            f"MAD {100 * touchdowns.median_absolute_deviation(stats.position):.1f} cm",
         ]
     else:
         axis.set(yticks=[], ylim=(0, 1))
@@ -325,7 +319,7 @@ def draw_deviations(axis: Axes, results: dict[str, dict[int, FlightStats]]) -> N
     bars = [(f"paper: {name}", value, "", "0.7") for name, value in PAPER.items()]
     for row, (label, stats) in enumerate(results.items()):
         x = stats[cross_section.DOWN].position
-        value = 100 * median_absolute_deviation(x) if len(x) else 0.0
+        value = 100 * touchdowns.median_absolute_deviation(x) if len(x) else 0.0
         bars.append((label, value, f", n = {len(x)}" if len(x) else NONE, f"C{row}"))
     for y, (_, value, note, colour) in enumerate(bars):
         axis.barh(y, value, color=colour)

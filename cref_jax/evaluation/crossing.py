@@ -11,6 +11,7 @@ from cref_jax.config import Config
 from cref_jax.env.world import World, make_world
 from cref_jax.evaluation import lateral_drift, protocol, trials
 from cref_jax.evaluation.protocol import LANE_SEEDS
+from cref_jax.evaluation.witness import Witness
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import generators, lanes
 from cref_jax.training import rollout
@@ -51,15 +52,17 @@ def cross(
     seed: int = 0,
     on_finished: Callable[[int], None] = lambda count: None,
     randomised: bool = False,
+    witness: Witness | None = None,
 ) -> LaneResult:
     """Run trials of the policy's mean action on lanes with these obstacles."""
     world = crossing_world(c, physics, kind, size)
     if randomised:
         world = world.replace(config=protocol.randomise(world.config))
     specs = trials.TrialSpecs(np.arange(count), *crossing_lanes(count))
-    outcomes = trials.run(
-        world, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
-    )
+    cell = {"kind": kind, "size_m": size}
+    look = witness.watch(world, [cell], specs) if witness else trials.LOOK_AWAY
+    step_fn, block = trials.make_step_fn(train), protocol.robots_per_block()
+    outcomes = trials.run(world, step_fn, specs, seed, block, on_finished, look)
     succeeded = outcomes.succeeded
     return LaneResult(
         kind=kind,

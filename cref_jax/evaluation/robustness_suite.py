@@ -16,6 +16,7 @@ from cref_jax.env.state import Spread
 from cref_jax.env.world import World
 from cref_jax.evaluation import intervals, lateral_drift, paper_results, protocol, tables, trials
 from cref_jax.evaluation.trials import Trials
+from cref_jax.evaluation.witness import Witness
 from cref_jax.physics.simulation import Physics
 
 EVERYTHING = "everything"
@@ -75,6 +76,7 @@ def run_rows(
     seed: int,
     on_finished: Callable[[int], None] = lambda count: None,
     selected: Sequence[Row] | None = None,
+    witness: Witness | None = None,
 ) -> list[dict[str, Any]]:
     """Run `count` trials per row; `on_finished(n)` is called as trials end."""
     every = list(selected or list_rows())
@@ -84,7 +86,11 @@ def run_rows(
         rows = [row for row in every if row.part in parts]
         if rows:
             found |= dict(
-                zip(rows, _run_in(world, train, rows, count, seed, on_finished), strict=True)
+                zip(
+                    rows,
+                    _run_in(world, train, rows, count, seed, on_finished, witness),
+                    strict=True,
+                )
             )
     return [found[row] for row in every]
 
@@ -96,8 +102,9 @@ def _run_in(
     count: int,
     seed: int,
     on_finished: Callable[[int], None],
+    witness: Witness | None,
 ) -> list[dict[str, Any]]:
-    """Run the rows that share a world."""
+    """Run the rows that share a world; the witness sees those with everything randomised."""
     on = [
         tables.round_robin_lanes(LANES[row.kind], LEVELS.index(row.level), count, w.lanes.kinds)
         for row in rows
@@ -107,8 +114,10 @@ def _run_in(
     # same start, command and draws on a lane, whichever parts are randomised
     number = np.tile(np.arange(count), len(rows))
     specs = trials.TrialSpecs(number, kind, level, spread)
+    seen = [_describe(row) if row.part == EVERYTHING else None for row in rows]
+    look = witness.watch(w, seen, specs) if witness else trials.LOOK_AWAY
     outcomes = trials.run(
-        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
+        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished, look
     )
     part = lambda k: Trials(*(x[k * count : (k + 1) * count] for x in outcomes))
     return [_row_result(row, part(k)) for k, row in enumerate(rows)]
@@ -166,11 +175,16 @@ def _spread(part: str) -> Spread:
     return Spread(*(np.float32(name == part) for name in Spread._fields))
 
 
+def _describe(row: Row) -> dict[str, Any]:
+    size = obstacle_size(row.kind, row.level)
+    return {"kind": row.kind, "level": row.level, "size_m": size}
+
+
 def _row_result(row: Row, outcomes: Trials) -> dict[str, Any]:
     rate = intervals.wilson(int(outcomes.succeeded.sum()), len(outcomes.succeeded))
     return {
-        **row._asdict(),
-        "size_m": obstacle_size(row.kind, row.level),
+        "part": row.part,
+        **_describe(row),
         "trials": len(outcomes.succeeded),
         "successes": int(outcomes.succeeded.sum()),
         "rate": rate.value,

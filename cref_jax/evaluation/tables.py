@@ -19,6 +19,7 @@ from cref_jax.evaluation import intervals, lateral_drift, paper_results, protoco
 from cref_jax.evaluation.intervals import Rate
 from cref_jax.evaluation.paper_results import Cell
 from cref_jax.evaluation.trials import Trials
+from cref_jax.evaluation.witness import Witness
 from cref_jax.physics.simulation import Physics
 from cref_jax.terrain import lanes
 
@@ -85,14 +86,20 @@ def run_cells(
     count: int,
     seed: int,
     on_finished: Callable[[int], None] = lambda count: None,
+    witness: Witness | None = None,
 ) -> dict[Cell, CellOutcomes]:
     """Run `count` trials per cell; `on_finished(n)` is called as trials end."""
     every = list(paper_results.METHODS[paper_results.FULL].success)
     on = [cell_lanes(cell, count, w.lanes.kinds) for cell in every]
     kind, level = map(np.concatenate, zip(*on, strict=True))
     specs = trials.TrialSpecs(np.tile(np.arange(count), len(every)), kind, level)
+    look = (
+        witness.watch(w, [_describe(cell) for cell in every], specs)
+        if witness
+        else trials.LOOK_AWAY
+    )
     outcomes = trials.run(
-        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished
+        w, trials.make_step_fn(train), specs, seed, protocol.robots_per_block(), on_finished, look
     )
     down = kind == w.lanes.kinds.index("descent")
     part = lambda k: slice(k * count, (k + 1) * count)
@@ -180,17 +187,20 @@ def interval_note(count: int) -> str:
     )
 
 
+def _describe(cell: Cell) -> dict[str, Any]:
+    kind, level = cell
+    return {"kind": kind, "level": level, "size_m": cell_sizes()[kind][level]}
+
+
 def _cell_row(cell: Cell, outcomes: list[CellOutcomes]) -> dict[str, Any]:
     """Build one row from the pooled trials of all policies."""
-    kind, level = cell
+    kind, _ = cell
     all_trials = Trials(*map(np.concatenate, zip(*(o.trials for o in outcomes), strict=True)))
     lost, is_down = ~all_trials.succeeded, np.concatenate([o.is_down for o in outcomes])
     rate = intervals.wilson(int((~lost).sum()), len(lost))
     by_policy = [float(o.trials.succeeded.mean()) for o in outcomes]
     return {
-        "kind": kind,
-        "level": level,
-        "size_m": cell_sizes()[kind][level],
+        **_describe(cell),
         "trials": len(lost),
         "successes": int((~lost).sum()),
         "rate": rate.value,

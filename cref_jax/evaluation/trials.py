@@ -38,6 +38,8 @@ AXIS = "robots"  # of the mesh
 
 # a jax.tree_util.Partial avoids retracing
 StepFn = Callable[[World, Robots], tuple[Robots, Outcome]]
+Look = Callable[[int, "Walk"], None]
+LOOK_AWAY: Look = lambda trial, walk: None
 
 
 class TrialSpecs(NamedTuple):
@@ -69,6 +71,21 @@ class Trials(NamedTuple):
         return {name: int((self.ending == ENDINGS.index(name)).sum()) for name in FAILURES}
 
 
+class Walk(NamedTuple):
+    """One trial as it was walked: T steps, its last one included."""
+
+    qpos: Float[np.ndarray, "T Q"]  # before each step
+    airborne: Bool[np.ndarray, "T F"]  # after it: the foot is off the ground
+    ending: str  # one of ENDINGS
+
+
+class Poses(NamedTuple):
+    """What pictures need of E robots at T steps."""
+
+    qpos: Float[Array | np.ndarray, "T E Q"]  # before the step
+    airborne: Bool[Array | np.ndarray, "T E F"]  # after it
+
+
 class TrialTrace(NamedTuple):
     """Measures of E robots at T steps; after a robot's first end they belong to a new episode."""
 
@@ -76,6 +93,9 @@ class TrialTrace(NamedTuple):
     progress: Float[Array | np.ndarray, "T E"]  # m from the start along the lane
     forward: Float[Array | np.ndarray, "T E"]  # m/s, body frame
     y: Float[Array | np.ndarray, "T E"]  # m across the lane, before the step
+
+
+Part = tuple[TrialTrace, Poses]  # of `CHUNK` steps
 
 
 def make_step_fn(train: ppo.TrainState) -> StepFn:
@@ -100,6 +120,7 @@ def run(
     seed: int,
     block: int,
     on_finished: Callable[[int], None] = lambda count: None,
+    look: Look = LOOK_AWAY,
 ) -> Trials:
     """Run the trials and classify their outcomes.
 
@@ -110,6 +131,7 @@ def run(
         seed: of the starts and commands.
         block: robots stepped together on one device.
         on_finished: called with the number of trials that have ended since the last call.
+        look: called with each trial's index in `specs` and its walk, in the order of their ends.
     """
     slots = _Slots(specs.number, block)
     mesh = jax.make_mesh(
@@ -136,7 +158,9 @@ def run(
         robots, part = _run_chunk(world, step_fn, robots, mesh)
         clock += CHUNK
         over = slots.update(jax.tree.map(np.asarray, part), world.config)
-        results |= over
+        for trial, (outcome, walk) in over.items():
+            results[trial] = outcome
+            look(trial, walk)
         on_finished(len(over))
     return Trials(*map(np.concatenate, zip(*(results[k] for k in sorted(results)), strict=True)))
 
@@ -177,6 +201,13 @@ class _ActiveTrial:
     trial: int
     speed: Float[np.ndarray, "1"]  # m/s, commanded
     parts: list[TrialTrace] = dataclasses.field(default_factory=list)
+    poses: list[Poses] = dataclasses.field(default_factory=list)
+
+    def walk(self, outcome: Trials, period: float) -> Walk:
+        """Join the poses up to the trial's end."""
+        steps = round(float(outcome.seconds[0]) / period)
+        qpos, airborne = (np.concatenate(x)[:steps, 0] for x in zip(*self.poses, strict=True))
+        return Walk(qpos, airborne, ENDINGS[outcome.ending[0]])
 
 
 class _Slots:
@@ -208,16 +239,19 @@ class _Slots:
         """Start to follow the trials in these slots."""
         self.active |= {k: _ActiveTrial(int(self.trial[k]), speed[k : k + 1]) for k in new}
 
-    def update(self, part: TrialTrace, c: Config) -> dict[int, Trials]:
+    def update(self, part: Part, c: Config) -> dict[int, tuple[Trials, Walk]]:
         """Add these `CHUNK` steps, and return the trials that ended in them."""
         period, over = c.physics.control_period, {}
         for slot, running in list(self.active.items()):
-            running.parts.append(jax.tree.map(lambda x, k=slot: x[:, k : k + 1], part))
+            trace, poses = jax.tree.map(lambda x, k=slot: x[:, k : k + 1], part)
+            running.parts.append(trace)
+            running.poses.append(poses)
             trace = jax.tree.map(lambda *x: np.concatenate(x), *running.parts)
             steps = len(trace.progress)
             first = np.minimum(*_first_ends(trace, running.speed, period))
             if first[0] < steps or steps * period >= c.episode.length:
-                over[running.trial] = classify(trace, running.speed, period)
+                outcome = classify(trace, running.speed, period)
+                over[running.trial] = outcome, running.walk(outcome, period)
                 del self.active[slot]
         return over
 
@@ -287,17 +321,16 @@ def _replace_robots(robots: Robots, fresh: Robots, is_new: Bool[Array, " E"], c:
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
-def _run_chunk(
-    world: World, step_fn: StepFn, robots: Robots, mesh: Mesh
-) -> tuple[Robots, TrialTrace]:
+def _run_chunk(world: World, step_fn: StepFn, robots: Robots, mesh: Mesh) -> tuple[Robots, Part]:
     """Step the robots `CHUNK` times."""
 
-    def advance(world: World, step_fn: StepFn, robots: Robots) -> tuple[Robots, TrialTrace]:
-        def step(robots: Robots, _: None) -> tuple[Robots, TrialTrace]:
-            y = robots.env.body.qpos[:, 1]
+    def advance(world: World, step_fn: StepFn, robots: Robots) -> tuple[Robots, Part]:
+        def step(robots: Robots, _: None) -> tuple[Robots, Part]:
+            qpos = robots.env.body.qpos
             robots, outcome = step_fn(world, robots)
             m = outcome.measures
-            return robots, TrialTrace(outcome.ending, m.progress, m.forward_speed, y)
+            trace = TrialTrace(outcome.ending, m.progress, m.forward_speed, qpos[:, 1])
+            return robots, (trace, Poses(qpos, m.airborne))
 
         return jax.lax.scan(step, robots, None, length=CHUNK)
 

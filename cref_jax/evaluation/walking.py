@@ -1,7 +1,7 @@
 """Episodes on flat ground, each counted until its robot's first end."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from cref_jax import ppo
 from cref_jax.config import Config
 from cref_jax.env.state import Ending
 from cref_jax.env.world import World, make_world
-from cref_jax.evaluation import lateral_drift, protocol, trials
+from cref_jax.evaluation import gait_pattern, lateral_drift, protocol, trials
 from cref_jax.evaluation.protocol import SECONDS
 from cref_jax.physics.simulation import Physics
 from cref_jax.training import rollout
@@ -29,6 +29,7 @@ class WalkResult(NamedTuple):
     airborne: tuple[float, float]  # share of time off the ground, left and right foot
     step_seconds: float  # mean time between touchdowns of one foot
     sideways: dict[str, float]  # m, see lateral_drift.summarize
+    gait: list[dict[str, Any]]  # of the first episode, see gait_pattern.describe
 
     def line(self) -> str:
         """Format the outcome as one line."""
@@ -102,6 +103,7 @@ def _count_by_cause(ending: Ending) -> dict[str, int]:
 
 
 def _summarize(ending: Ending, trace: _EpisodeStep, c: Config) -> WalkResult:
+    first = trace.airborne[trace.alive[:, 0], 0]
     alive, steps = trace.alive, np.maximum(trace.alive.sum(axis=0), 1)
     of_episode = lambda x: np.sum(x * alive, axis=0) / steps
     both = trace.alive[..., None]
@@ -117,4 +119,5 @@ def _summarize(ending: Ending, trace: _EpisodeStep, c: Config) -> WalkResult:
         airborne=(float(airborne[0]), float(airborne[1])),
         step_seconds=float(seconds / max(touchdowns, 1)),
         sideways=lateral_drift.summarize(*lateral_drift.measure(trace.y, alive)),
+        gait=[{"lane": "flat", **gait_pattern.describe(first, c.physics.control_period)}],
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cref_jax.errors import ConfigError
-from cref_jax.pages import evaluation_charts, evaluation_tables, markup
+from cref_jax.pages import evaluation_charts, evaluation_tables, markup, walk_pictures
 from cref_jax.pages.evaluation_charts import FailureCounts, SpeedCurve, SuccessRate, display_name
 from cref_jax.pages.markup import MISSING, Column, Html, Section, element, join, paragraph
 from cref_jax.terrain import generators
@@ -48,7 +48,8 @@ def write(record: Record, out: Path) -> None:
     Raises:
         ConfigError: `out` is not .html or cannot be written, or the record has an unknown form.
     """
-    markup.write(out, markup.document(title(record), lead(record), sections(record)))
+    body = sections(record, out.parent)
+    markup.write(out, markup.document(title(record), lead(record), body))
 
 
 def title(record: Record) -> str:
@@ -67,13 +68,13 @@ def lead(record: Record) -> Html:
     return _refuse_unknown_form(lambda: markup.tiles(_make_tiles(record)))
 
 
-def sections(record: Record) -> list[Section]:
-    """Build the sections below the headline figures.
+def sections(record: Record, folder: Path | None = None) -> list[Section]:
+    """Build the sections below the headline figures; films are files of `folder`.
 
     Raises:
         ConfigError: the record has an unknown form.
     """
-    return _refuse_unknown_form(lambda: list(_make_sections(record)))
+    return _refuse_unknown_form(lambda: list(_make_sections(record, folder)))
 
 
 def _refuse_unknown_form(make: Any) -> Any:
@@ -84,7 +85,7 @@ def _refuse_unknown_form(make: Any) -> Any:
         raise ConfigError(f"this evaluation has an unknown form: {error!r}") from None
 
 
-def _make_sections(record: Record) -> Iterator[Section]:
+def _make_sections(record: Record, folder: Path | None) -> Iterator[Section]:
     cells = record.get("cells") or []
     if cells:
         yield Section("Success by kind and level", _success_body(record, cells))
@@ -107,6 +108,7 @@ def _make_sections(record: Record) -> Iterator[Section]:
     plain = _plain_body(record)
     if plain and not cells:
         yield Section("Result", plain)
+    yield from walk_pictures.sections(record, folder)
     yield Section("How it was measured", _method_body(record))
 
 

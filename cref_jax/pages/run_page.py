@@ -122,12 +122,18 @@ def provenance_body(starts: tuple[Mapping[str, Any], ...]) -> Html:
     return join(markup.table(columns, rows), used)
 
 
-def evaluation_body(record: Any, source: str, iteration: int | None = None) -> Html:
-    """Build an evaluation as part of another page; `iteration` is the run's latest checkpoint."""
+def evaluation_body(
+    record: Any, source: str, iteration: int | None = None, folder: Path | None = None
+) -> Html:
+    """Build an evaluation as part of another page.
+
+    `iteration` is the run's latest checkpoint; films are files of `folder`.
+    """
     try:
         if not isinstance(record, dict):
             raise ConfigError("this evaluation is not a JSON object")
-        shown = [evaluation_page.lead(record), markup.subsections(evaluation_page.sections(record))]
+        sections = evaluation_page.sections(record, folder)
+        shown = [evaluation_page.lead(record), markup.subsections(sections)]
     except ConfigError as error:
         return note(code(source), f": {error}.")
     measured = record.get("iteration")
@@ -233,7 +239,7 @@ def _evaluation_sections(run: RunRecord) -> Iterator[Section]:
     order += [suite for suite in shown if suite not in order]
     for name, record in map(shown.__getitem__, order):
         title = evaluation_page.title(record) if isinstance(record, dict) else name
-        yield Section(title, evaluation_body(record, name, newest))
+        yield Section(title, evaluation_body(record, name, newest, run.folder))
     if older:
         yield Section("Older evaluations", paragraph(", ".join(older)))
     if not shown:

@@ -111,6 +111,18 @@ def test_who_blows_up_beyond_the_finish_has_failed(world):
     assert run(world, blows_up).failures()["unstable"] == 4
 
 
+def test_who_looks_is_shown_the_walk_of_each_trial_to_its_end(world):
+    walks = {}
+    found = trials.run(world, carried, asked(4), 0, 3, look=lambda k, walk: walks.update({k: walk}))
+    assert sorted(walks) == [0, 1, 2, 3]
+    for k, walk in walks.items():
+        assert len(walk.qpos) == len(walk.airborne) == round(found.seconds[k] / PERIOD)
+        assert walk.ending == "finished"
+        assert walk.airborne[5:].all()  # they are carried high above the lane
+        # each step moves the base by the commanded speed
+        np.testing.assert_allclose(np.diff(walk.qpos[:, 0]), found.speed[k] * PERIOD, atol=2e-3)
+
+
 def test_a_trial_does_not_depend_on_how_many_there_are(world):
     few, many = (run(world, carried, count) for count in (2, 8))
     for a, b in zip(few, many, strict=True):
@@ -133,8 +145,13 @@ def test_where_one_has_come_to_its_end_the_next_begins():
     assert slots.fill().size == 0
     seen = trace(trials.CHUNK, robots=6, finished=20)
     flags = seen.ending.finished & (np.arange(6) == 4)
-    over = slots.update(seen._replace(ending=seen.ending._replace(finished=flags)), C)
-    assert list(over) == [4] and over[4].seconds == pytest.approx(21 * PERIOD)
+    qpos = np.tile(np.arange(6, dtype=np.float32)[:, None], (trials.CHUNK, 1, 7))
+    poses = trials.Poses(qpos, qpos[..., :2] > 3.5)
+    over = slots.update((seen._replace(ending=seen.ending._replace(finished=flags)), poses), C)
+    ((outcome, walk),) = over.values()
+    assert list(over) == [4] and outcome.seconds == pytest.approx(21 * PERIOD)
+    np.testing.assert_array_equal(walk.qpos, np.full((21, 7), 4.0))  # its own slot, to its end
+    assert walk.airborne.shape == (21, 2) and walk.airborne.all() and walk.ending == "finished"
     assert slots.fill().tolist() == [4] and slots.trial.tolist() == [0, 1, 2, 3, 7, 5]
 
 

@@ -19,7 +19,7 @@ from cref_jax import cli, config
 from cref_jax.config import Config
 from cref_jax.env.world import World, build_world
 from cref_jax.errors import ConfigError
-from cref_jax.evaluation import attention, recorder
+from cref_jax.evaluation import attention, recorder, touchdowns
 from cref_jax.evaluation.recorder import Moment, StepRecords
 from cref_jax.policy import writer
 from cref_jax.terrain import atlas, cross_section, lanes
@@ -134,7 +134,7 @@ def test_what_a_robot_walks_on():
 
 def test_median_absolute_deviation():
     # median 3; deviations 2, 1, 0, 1, 97 have the median 1
-    assert foothold_lab.median_absolute_deviation(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == 1.0
+    assert touchdowns.median_absolute_deviation(np.array([1.0, 2.0, 3.0, 4.0, 100.0])) == 1.0
 
 
 def stairs_steps(touchdown, air_time, x, z, riser, distance):
