@@ -29,7 +29,7 @@ from cref_jax.robot import ROBOTS, fill_in
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
-from cref_jax.training import devices, iteration, processes, resumption, run_dir, trainer
+from cref_jax.training import devices, iteration, processes, resumption, run_dir, trainer, wandb_log
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
@@ -88,6 +88,8 @@ class Options(cli.DebugOption):
     """evaluate 100 episodes on flat ground at the end"""
     tensorboard: bool = True
     """write TensorBoard files"""
+    wandb: bool = False
+    """log to Weights & Biases as well (pip install 'cref-jax[wandb]'): offline without a login"""
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,8 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
 
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
+    if options.wandb:
+        wandb_log.check_installed()
     run_dir.check_writable(options.run_dir or run_dir.ROOT)
     mesh = devices.choose_mesh(c, options.devices)
     threads = max(parallel.cores() // len(mesh.local_devices), 1)
@@ -215,7 +219,8 @@ def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Report
     run_dir.write_config(run, c)
     run_dir.write_origin(run, first, c.terrain.name, resolve_engine(options.engine))
     samples = c.run.num_envs * c.ppo.horizon
-    return Reporter(run, first, c.run.iterations, samples, options.tensorboard)
+    wandb = dataclasses.asdict(c) if options.wandb else None
+    return Reporter(run, first, c.run.iterations, samples, options.tensorboard, wandb)
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import numpy as np
@@ -98,6 +99,25 @@ def test_a_resumed_run_says_what_changes_and_what_is_not_taken(first, tmp_path):
     assert resumption.describe_unused(c, str(tmp_path / "mine.toml")) == [
         f"{tmp_path}/mine.toml has --ppo.gamma 0.5, and the run goes on with 0.99"
     ]
+
+
+def test_wandb_without_its_package_is_one_line_before_anything_is_written(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(SystemExit) as end:
+        run(tmp_path / "run", "--wandb")
+    assert end.value.code == 2 and not (tmp_path / "run").exists()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "pip install 'cref-jax[wandb]'" in error
+
+
+@pytest.mark.slow
+def test_training_goes_on_where_wandb_fails(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "wandb", ModuleType("wandb"))  # it has no call at all
+    run(tmp_path / "run", "--wandb")
+    assert capsys.readouterr().out.count("warning: no more is logged to wandb") == 1
+    assert Checkpoints(tmp_path / "run" / "checkpoints").latest() is not None
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from rich.console import Console, Group
@@ -13,6 +14,8 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from tensorboardX import SummaryWriter
+
+from cref_jax.training.wandb_log import WandbLog
 
 PLAIN_SECONDS = 20.0  # between two lines without a terminal
 SHOWN = {  # name in the log: name on the screen and unit
@@ -28,15 +31,25 @@ SHOWN = {  # name in the log: name on the screen and unit
 
 
 class Reporter:
-    """Writes every iteration to `log.jsonl` and TensorBoard, and shows the latest figures."""
+    """Writes every iteration to `log.jsonl`, TensorBoard and W&B, and shows the latest figures."""
 
     def __init__(
-        self, run: Path, first: int, last: int, samples: int, tensorboard: bool = True
+        self,
+        run: Path,
+        first: int,
+        last: int,
+        samples: int,
+        tensorboard: bool = True,
+        wandb: Mapping[str, Any] | None = None,
     ) -> None:
-        """Report iterations `first` to `last`, of `samples` samples each."""
+        """Report iterations `first` to `last`, of `samples` samples each.
+
+        `wandb` are the settings of the run that its log at Weights & Biases shows, if it has one.
+        """
         self.console = Console()
         self._file = (run / "log.jsonl").open("a", encoding="utf-8")
         self._board = SummaryWriter(str(run / "tensorboard")) if tensorboard else None
+        self._wandb = WandbLog(run, wandb, self.say) if wandb is not None else None
         self._last, self._samples = last, samples
         self._live: Live | None = None
         self._bar = Progress(
@@ -68,6 +81,8 @@ class Reporter:
             closing.callback(self._file.close)
             if self._board:
                 closing.callback(self._board.close)
+            if self._wandb:
+                closing.callback(self._wandb.close)
             if self._live:
                 closing.callback(self._live.stop)
 
@@ -86,6 +101,8 @@ class Reporter:
             if self._board:
                 for name, value in row.items():
                     self._board.add_scalar(name, value, first + i + 1)
+            if self._wandb:
+                self._wandb.log(row, first + i + 1)
         self._file.flush()
         self._show(first + count, {name: float(v.mean()) for name, v in log.items()}, rate)
 

@@ -4,6 +4,7 @@ runs/NAME/config.json     every setting, so that the run can be resumed or evalu
 runs/NAME/origin.jsonl    versions, device, command line and git state at each start
 runs/NAME/log.jsonl       one line per iteration
 runs/NAME/tensorboard/    the same for TensorBoard
+runs/NAME/wandb/          the same for Weights & Biases, and wandb_id: the id of its run there
 runs/NAME/checkpoints/    see checkpoint.py
 """
 
