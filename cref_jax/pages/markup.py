@@ -17,12 +17,15 @@ from typing import NamedTuple
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from cref_jax.errors import ConfigError
 
 MEGABYTE = 1_000_000  # bytes
 MOST_PICTURE = 8 * MEGABYTE  # bytes per file; assumed: far above any still of this program
-MOST_VIDEO = 30 * MEGABYTE  # bytes per file; assumed: minutes of video that browsers still open
+MOST_VIDEO = 6 * MEGABYTE  # bytes per file; assumed: with it a page still opens within 3 s
+LARGE_PICTURE = MEGABYTE // 4  # bytes; a larger one is embedded with losses that nobody sees
+QUALITY = 85  # of WebP, up to 100
 CHART = (4.6, 2.7)  # inches: readable on a phone, and two fit side by side on a screen
 MISSING = "-"  # shown for an unknown number
 
@@ -252,6 +255,7 @@ def media(path: Path, most: int | None = None) -> Html:
     if content[place : place + len(signature)] != signature:
         return note(code(path.name), f" is not a valid {path.suffix.lower()[1:]} file.")
     if not is_video:
+        kind, content = _compress(kind, content)
         return element("div", _image(kind, content, path.name, path.name), class_="media")
     shown = element("video", controls="", preload="metadata", src=_data_url(kind, content))
     return element(
@@ -310,6 +314,23 @@ def write(out: Path, document: str) -> None:
         with contextlib.suppress(OSError):
             part.unlink()
         raise ConfigError(f"cannot write {out}: {error.strerror}") from None
+
+
+def _compress(kind: str, content: bytes) -> tuple[str, bytes]:
+    """Compress a large picture; return its media type and bytes, its own where that is no gain."""
+    if len(content) <= LARGE_PICTURE:
+        return kind, content
+    file = io.BytesIO()
+    try:
+        Image.open(io.BytesIO(content)).save(file, "webp", quality=QUALITY)
+    except (
+        OSError,
+        ValueError,
+        Image.DecompressionBombError,
+    ):  # a damaged one is shown as far as a browser can
+        return kind, content
+    smaller = file.getvalue()
+    return ("image/webp", smaller) if len(smaller) < len(content) else (kind, content)
 
 
 def _round_numbers(point: re.Match[str]) -> str:

@@ -17,7 +17,7 @@ from cref_jax.pages import evaluation_page, learning_charts, markup, training_lo
 from cref_jax.pages.markup import MISSING, Column, Html, Section, code, join, note, paragraph
 from cref_jax.pages.training_log import Log
 
-MOST_MEDIA = 60 * markup.MEGABYTE  # bytes of all images and videos per page; assumed: as MOST_VIDEO
+MOST_MEDIA = 12 * markup.MEGABYTE  # bytes of all images and videos per page; assumed: as MOST_VIDEO
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy", "python")
 
 Settings = dict[str, Any]

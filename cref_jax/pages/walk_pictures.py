@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from cref_jax.pages import evaluation_charts, markup
-from cref_jax.pages.markup import MISSING, Column, Html, Section, join, note, paragraph
+from cref_jax.pages.markup import MISSING, Column, Html, Section, element, join, note, paragraph
 from cref_jax.terrain import generators
 
 Record = Mapping[str, Any]
@@ -66,19 +66,16 @@ def touchdown_body(found: Record) -> Html:
         f"({100 * found['tread_m']:.0f} cm); below 0 it hangs over the edge. MAD: median absolute "
         f"deviation from the median; the paper has {PAPER_MAD} cm in descent."
     )
-    columns = [Column("stairs"), Column("foot")]
-    columns += [Column(title, True) for title in ("touchdowns", "median", "MAD")]
-    rows = [
-        (
-            f"{group['way']}, {_size(group)}",
-            group["foot"],
-            f"{group['touchdowns']:,}",
-            _centimetres(group["median_m"]),
-            _centimetres(group["mad_m"]),
-        )
-        for group in groups
-    ]
-    charts = markup.charts(*(touchdown_chart(found, way) for way in ways))
+    feet = (*FEET, "both")
+    columns = [Column("stairs"), *(Column(f"touchdowns {foot}", True) for foot in feet)]
+    columns += [Column(f"{name} {foot}", True) for name in ("median", "MAD") for foot in feet]
+    rows = []
+    for way, size in dict.fromkeys((group["way"], group["size_m"]) for group in groups):
+        of = {g["foot"]: g for g in groups if (g["way"], g["size_m"]) == (way, size)}
+        cells = [f"{of[foot]['touchdowns']:,}" for foot in feet]
+        cells += [_centimetres(of[foot][key]) for key in ("median_m", "mad_m") for foot in feet]
+        rows.append((f"{way}, {generators.format_size('stairs', size)}", *cells))
+    charts = markup.wide_charts(*(touchdown_chart(found, way) for way in ways))
     return join(paragraph(text), charts, markup.table(columns, rows))
 
 
@@ -115,7 +112,7 @@ def touchdown_chart(found: Record, way: str) -> Html:
 
 def film_body(films: Sequence[Record], folder: Path | None) -> Html:
     """Build the section of failures on film; files are looked for in `folder`, if there is one."""
-    return join(*(_film(film, folder) for film in films))
+    return markup.wide_charts(*(element("div", _film(film, folder)) for film in films))
 
 
 def sections(record: Record, folder: Path | None) -> list[Section]:
@@ -133,8 +130,9 @@ def sections(record: Record, folder: Path | None) -> list[Section]:
 def _film(film: Record, folder: Path | None) -> Html:
     where = " ".join(str(film[key]) for key in ("kind", "level") if key in film)
     way = f", {NAMES[film['lane']]}" if film["lane"] in NAMES else ""
+    which = f"first of {film['failures']} failures" if film["failures"] > 1 else "only failure"
     text = (
-        f"{where}, {_size(film)}{way}: the first of {film['failures']} failures, "
+        f"{where}, {_size(film)}{way}: the {which}, "
         f"{evaluation_charts.display_name(film['ending'])} after {film['seconds']:.1f} s."
     )
     if "why" in film:

@@ -1,9 +1,11 @@
 """A page shows what it is given, as text, and needs nothing outside of it."""
 
 import base64
+import io
 import os
 import re
 
+import numpy as np
 import pytest
 from html_reader import Page, leaves, read
 from PIL import Image
@@ -82,11 +84,32 @@ def test_rounding_keeps_every_point_and_the_scale_of_letters():
     assert "scale(0.015625)" in drawn
 
 
-def test_a_picture_is_in_the_page_bit_for_bit(tmp_path):
+def test_a_small_picture_is_in_the_page_bit_for_bit(tmp_path):
     path = tmp_path / "a.png"
     Image.effect_noise((64, 48), 50.0).save(path)
     inside = re.search(r"data:image/png;base64,([^\"]+)", markup.media(path))[1]
     assert base64.b64decode(inside) == path.read_bytes()
+
+
+def test_a_large_picture_is_compressed_and_looks_the_same(tmp_path):
+    slope = Image.linear_gradient("L").resize((900, 900))
+    picture = Image.merge("RGB", (slope, slope.rotate(90), slope.rotate(180)))
+    picture.save(tmp_path / "a.png", compress_level=0)
+    before = (tmp_path / "a.png").stat().st_size
+    assert before > markup.LARGE_PICTURE
+    inside = re.search(r"data:image/webp;base64,([^\"]+)", markup.media(tmp_path / "a.png"))[1]
+    content = base64.b64decode(inside)
+    assert len(content) < 0.1 * before
+    shown = np.asarray(Image.open(io.BytesIO(content)).convert("RGB"), float)
+    assert np.abs(shown - np.asarray(picture)).mean() < 3.0  # of 255
+
+
+def test_a_large_picture_that_is_cut_off_is_shown_as_it_is(tmp_path):
+    Image.effect_noise((900, 900), 50.0).save(tmp_path / "a.png")
+    cut = (tmp_path / "a.png").read_bytes()[:400_000]
+    (tmp_path / "a.png").write_bytes(cut)
+    inside = re.search(r"data:image/png;base64,([^\"]+)", markup.media(tmp_path / "a.png"))[1]
+    assert base64.b64decode(inside) == cut
 
 
 def test_a_film_is_in_the_page_or_named_where_it_is_too_large(tmp_path):
