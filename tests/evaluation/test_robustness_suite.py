@@ -11,6 +11,8 @@ from cref_jax.config import Randomisation
 from cref_jax.env.state import Spread
 from cref_jax.evaluation import robustness_suite
 from cref_jax.evaluation.robustness_suite import EVERYTHING, PARTS, STRUCTURES
+from cref_jax.evaluation.trials import Walk
+from cref_jax.evaluation.witness import Witness
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +40,19 @@ def test_the_ranges_are_the_projects_own_whatever_a_policy_was_trained_with(worl
 def test_a_row_is_tried_on_lanes_of_its_size(world, monkeypatch):
     seen = {}
 
-    def run(w, walker, asked, seed, block, ended):
+    def run(w, walker, asked, seed, block, ended, look):
+        for trial in range(len(asked.number)):
+            look(trial, Walk(np.zeros((2, 7)), np.zeros((2, 2), bool), "low"))
         seen[w.config.randomisation.structures] = asked
         one = np.ones(len(asked.number), np.float32)
         ending = (asked.number % 2).astype(int)
         return robustness_suite.Trials(one, ending, one, one, one, one)
 
     monkeypatch.setattr(robustness_suite.trials, "run", run)
-    found = robustness_suite.run_rows(world, ppo.TrainState(*5 * [None]), 10, 0)
+    saw = Witness()
+    found = robustness_suite.run_rows(world, ppo.TrainState(*5 * [None]), 10, 0, witness=saw)
+    # twelve cells, a longer gap and a higher box, with everything randomised
+    assert [failure.failures for failure in saw.worst(99)] == [10] * 14
     place = dict.fromkeys(seen, 0)
     for k, row in enumerate(robustness_suite.list_rows()):
         structures = 8 if row.part in (EVERYTHING, STRUCTURES) else 0

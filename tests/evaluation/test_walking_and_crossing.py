@@ -48,6 +48,7 @@ def test_what_comes_after_a_fall_does_not_count():
     error = np.array([[0.2, 0.4], [0.2, 0.4], [9.0, 0.4], [9.0, 0.4]], np.float32)
     walk = _summarize(ending(2), seen._replace(forward_error=error), Config())
     assert walk.speed_error == pytest.approx(0.3)  # (0.2 + 0.4) / 2
+    assert walk.gait[0]["contacts"] == [[[0.0, 0.04]], [[0.0, 0.04]]]  # both down for two steps
     # 10 cm aside a step: 0.1 and 0.3 m until their ends
     assert walk.sideways == pytest.approx({"drift_m": 0.2, "largest_m": 0.2, "worst_m": 0.3})
 
