@@ -22,7 +22,7 @@ COMMANDS = (
     "params",
     "doctor",
 )
-DEMO = ("play", "--live", "--policy", "robust")  # needs no training
+DEMO = ("play", "--live", "--browser", "--policy", "robust")  # needs no training
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -93,6 +93,8 @@ class Options(cli.PolicyOptions):
     """address that the page listens on; the default is this machine alone"""
     port: Annotated[int, Within(1, 65535)] = 8080
     """port of the page; if it is taken, the next free one"""
+    browser: bool = False
+    """with --live: open the page in the browser, where this machine has a desktop"""
 
 
 class Recording(NamedTuple):
@@ -186,8 +188,8 @@ def drive(options: Options) -> None:
         atlas = _build_lane(dataclasses.replace(c.terrain, name=terrain), options)
         kind = options.kind or atlas.kinds[0]
         place = Place(kind, float(atlas.sizes[0, atlas.kinds.index(kind)]))
-    settings = Settings(source, place, options.seed, options.command, options.host, options.port)
-    server.serve(settings)
+    address = options.host, options.port, options.browser
+    server.serve(Settings(source, place, options.seed, options.command, *address))
 
 
 def record(world: World, train: ppo.TrainState | None, options: Options) -> Recording:

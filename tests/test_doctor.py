@@ -71,7 +71,7 @@ def test_a_misspelt_command_is_one_line(capsys):
     [
         (["eval", "--suite", "walk"], "cref_jax.eval", ["--suite", "walk"]),
         (["gpu-program"], "cref_jax.gpu_program", []),
-        (["demo", "--seed", "1"], "cref_jax.play", ["--live", "--policy", "robust", "--seed", "1"]),
+        (["demo", "--seed", "1"], "cref_jax.play", [*door.DEMO[1:], "--seed", "1"]),
     ],
 )
 def test_a_command_is_the_module_of_its_name(monkeypatch, asked, module, rest):

@@ -2,7 +2,10 @@
 
 import contextlib
 import io
+import os
 import socket
+import sys
+import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +31,7 @@ class Settings:
     speed: float | None = None  # m/s forward
     host: str = "127.0.0.1"
     port: int = 8080
+    opens_browser: bool = False
 
 
 def serve(settings: Settings) -> None:
@@ -39,6 +43,8 @@ def serve(settings: Settings) -> None:
     port = find_port(settings.host, settings.port)
     page = open_page(settings, port)
     print(describe_address(settings.host, port), flush=True)
+    if settings.opens_browser and _has_desktop():
+        webbrowser.open(f"http://{settings.host}:{port}")
     page.run()
 
 
@@ -51,6 +57,11 @@ def open_page(settings: Settings, port: int) -> Page:
         server = viser.ViserServer(settings.host, port, label="cref_jax", verbose=False)
     run = settings.policy if sources.is_run(sources.find_policy(settings.policy)) else None
     return Page(server, session, builder, run)
+
+
+def _has_desktop() -> bool:
+    """Check whether a browser would have a window; without one a text browser may open instead."""
+    return sys.platform != "linux" or bool({"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys())
 
 
 def find_port(host: str, port: int) -> int:

@@ -6,6 +6,7 @@ import threading
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -119,6 +120,21 @@ def test_it_says_how_to_reach_it_from_another_machine(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("desktop", "opened"), [("DISPLAY", ["http://127.0.0.1:8099"]), ("X", [])])
+def test_the_browser_opens_where_there_is_a_desktop(monkeypatch, desktop, opened):
+    """Without one a text browser would take the terminal."""
+    asked = []
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(desktop, ":0")
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(server.webbrowser, "open", asked.append)
+    monkeypatch.setattr(server, "find_port", lambda host, port: port)
+    monkeypatch.setattr(server, "open_page", lambda settings, port: SimpleNamespace(run=list))
+    server.serve(Settings(Path("robust"), Place("flat", 0.0), port=8099, opens_browser=True))
+    assert asked == opened
+
+
 def test_ctrl_c_ends_it_quietly():
     words = f"-m cref_jax.play --live --policy robust --scene curbs --port {free_port()}"
     command = [sys.executable, *words.split()]
