@@ -22,5 +22,9 @@ def test_the_count_of_each_variant_is_that_of_its_layers():
     assert lost == 8 * d * d + 2 * d
     assert {c["critic"] for c in counts.values()} == {full["critic"]}
     assert "depth_tokenizer" not in counts["blind"]
+    # 21 x 11 heights to 128, 64 and 32; with 45 numbers of proprioception to 3 gates of 256
+    teacher, gates = counts["hpl_teacher"], 3 * 256
+    assert teacher["height_encoder"] == (231 * 128 + 128) + (128 * 64 + 64) + (64 * 32 + 32)
+    assert teacher["gru"] == (45 + 32) * gates + gates + 256 * gates + 256
     table = params.build_table(counts)
     assert [str(column.header) for column in table.columns] == ["part", *counts]

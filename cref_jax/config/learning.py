@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind"]
+Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind", "hpl_teacher"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,11 @@ class Network:
     """Eq. 3 alone, or also all that rewards depend on and that is drawn per robot; assumed"""
     initial_std: float = 0.8  # of the action distribution
     min_std: float = 0.0  # of it, while training: late obstacles are found by exploring, too
+
+    @property
+    def sees(self) -> bool:
+        """Whether the actor has the depth camera's frames."""
+        return self.variant not in ("blind", "hpl_teacher")
 
 
 @dataclass(frozen=True)

@@ -152,6 +152,8 @@ RANGES: Ranges = {
         "x": Samples(-10, 10),
         "y": Samples(-10, 10),
         "ahead": Samples(-10, 10),
+        "teacher_x": Samples(-10, 10),
+        "teacher_y": Samples(-10, 10),
         "base_height": Within(0, 10),
         "clip": Within(0.001, 1000),
     },
@@ -224,6 +226,7 @@ def check(c: Config) -> None:
     _check_learning_rate(c)
     _check_footholds(c)
     _check_camera(c)
+    _check_mirror(c)
 
 
 def _check_minibatches(c: Config) -> None:
@@ -277,7 +280,7 @@ def _check_camera(c: Config) -> None:
     """Refuse images that the depth tokenizer's filters do not cover exactly."""
     if c.camera.window % 2 == 0:
         raise ConfigError(f"--camera.window must be 1, 3, 5, ..., not {c.camera.window}")
-    if c.network.variant == "blind":
+    if not c.network.sees:
         return
     if c.network.token % c.network.heads:
         heads = f"{c.network.heads} heads"
@@ -293,3 +296,9 @@ def _check_camera(c: Config) -> None:
                 f"--camera.shape: {size} {what} do not split into blocks of {blocks} x {blocks} "
                 f"pixels; take {near}"
             )
+
+
+def _check_mirror(c: Config) -> None:
+    """Refuse a symmetry loss of an actor whose inputs have no mirror here."""
+    if c.ppo.mirror_weight and c.network.variant == "hpl_teacher":
+        raise ConfigError("--ppo.mirror-weight must be 0 with --network.variant hpl_teacher")

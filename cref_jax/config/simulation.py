@@ -53,13 +53,16 @@ class Terrain:
 
 @dataclass(frozen=True)
 class Scan:
-    """The critic's height samples m_t, in the robot's yaw frame (Eq. 3)."""
+    """The critic's height samples m_t, in the robot's yaw frame (Eq. 3), and a teacher's."""
 
     x: tuple[float, float, int] = (-0.5, 1.1, 17)  # m from, m to, samples; assumed
     y: tuple[float, float, int] = (-0.4, 0.4, 9)  # m from, m to, samples; assumed
     ahead: tuple[float, float, int] = (-0.2, 1.0, 25)
     """m from, m to, samples of a finer row along x in the middle. assumed: 10 cm cannot tell where
     an edge is"""
+    teacher_x: tuple[float, float, int] = (-0.5, 1.5, 21)
+    """m from, m to, samples that a teacher sees; Humanoid Parkour Learning (arXiv 2406.10759)"""
+    teacher_y: tuple[float, float, int] = (-0.5, 0.5, 11)  # m from, m to, samples; as teacher_x
     base_height: float | None = None  # m, taken off: nominal, above the soles; None: the robot's
     clip: float = 1.0  # m; assumed
 

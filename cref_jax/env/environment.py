@@ -72,12 +72,15 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     see = lambda m: observations.proprioception(
         m, state.command, jnp.asarray(robot.nominal_pose), state.action
     )
-    scan = observations.height_scan(_ground(world, state), state.body.qpos, c.scan)
+    ground, qpos = _ground(world, state), state.body.qpos
+    scan = observations.height_scan(ground, qpos, c.scan)
+    taught = c.network.variant == "hpl_teacher"
     hidden = _hidden_state(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),
         privileged=observations.privileged_state(see(clean), clean.velocity, hidden, scan),
         velocity=clean.velocity,
+        heights=observations.teacher_heights(ground, qpos, c.scan) if taught else None,
     )
 
 

@@ -28,6 +28,7 @@ class Observation(NamedTuple):
     proprioception: Float[Array, " O"]  # o^p_t, Eq. 2
     privileged: Float[Array, " S"]  # s_t, Eq. 3
     velocity: Float[Array, "3"]  # m/s, the velocity estimator's target
+    heights: Float[Array, " G"] | None = None  # m, of the base above the ground; a teacher's alone
 
 
 class Part(NamedTuple):
@@ -128,6 +129,14 @@ def fine_row(
     """Compute the same along a row straight ahead, fine enough to locate the edge of a tread."""
     x = np.linspace(*c.ahead)
     return _clearance(ground, qpos, x, np.zeros_like(x), c)
+
+
+def teacher_heights(
+    ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
+) -> Float[Array, " G"]:
+    """Compute the same on the wider grid of a privileged teacher, row by row from behind."""
+    x, y = np.meshgrid(np.linspace(*c.teacher_x), np.linspace(*c.teacher_y), indexing="ij")
+    return _clearance(ground, qpos, x.ravel(), y.ravel(), c)
 
 
 def _clearance(

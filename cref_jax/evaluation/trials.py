@@ -261,7 +261,7 @@ def _is_camera_in_phase(c: Config, clock: int) -> bool:
     period = c.physics.control_period
     following = 1 + np.arange(round(c.episode.length / period))
     first, now = (depth.is_due(k + following, c.camera, period) for k in (0, clock))
-    return c.network.variant == "blind" or bool(jnp.all(first == now))
+    return not c.network.sees or bool(jnp.all(first == now))
 
 
 def _first_ends(
@@ -343,4 +343,4 @@ def _run_chunk(world: World, step_fn: StepFn, robots: Robots, mesh: Mesh) -> tup
 
 
 def _partition(c: Config) -> Robots:
-    return rollout.partition(AXIS, c.network.variant)
+    return rollout.partition(AXIS, c.network)

@@ -70,7 +70,7 @@ def _build_model(stage: Stage) -> mujoco.MjModel:
 def _draw(canvas: robot_scene.Canvas, film: Film) -> Iterator[robot_scene.Frame]:
     """Draw each moment, with what the policy saw beside it."""
     c = film.stage.body.config
-    sees = c.network.variant != "blind"
+    sees = c.network.sees
     for _, group in itertools.groupby(film.moments, attrgetter("episode")):
         moments = list(group)
         points = robot_scene.camera_path(np.stack([m.qpos for m in moments]), 1.0 / RATE)

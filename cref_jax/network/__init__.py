@@ -1,6 +1,7 @@
 """The actor and the critic (Sec. II-B)."""
 
 from cref_jax.network.actor_critic import Actor, Critic
+from cref_jax.network.parkour import ParkourActor
 from cref_jax.network.records import (
     Carry,
     DepthInput,
@@ -13,6 +14,7 @@ from cref_jax.network.records import (
     strides,
     zero_features,
 )
+from cref_jax.network.variants import build_actor
 
 __all__ = [
     "Actor",
@@ -22,6 +24,8 @@ __all__ = [
     "EncodedInput",
     "Features",
     "Output",
+    "ParkourActor",
+    "build_actor",
     "image_to_patches",
     "initial_carry",
     "patches_to_image",

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from cref_jax import config
 from cref_jax.network.frame_slots import repeat_frames
-from cref_jax.network.layers import MLP
+from cref_jax.network.layers import HEAD_SCALE, MLP
 from cref_jax.network.modules import (
     CrossAttention,
     DepthCompression,
@@ -25,8 +25,6 @@ from cref_jax.network.modules import (
     VelocityEstimator,
 )
 from cref_jax.network.records import Carry, DepthInput, EncodedInput, Features, Output
-
-_HEAD_SCALE = 0.01  # of the action head's last layer; assumed: the first actions are near zero
 
 
 class Actor(nn.Module):
@@ -56,7 +54,7 @@ class Actor(nn.Module):
         self.proprioceptive_tokenizer = MLP((c.token, c.token))
         self.fusion = GatedResidualFusion(gated=c.variant != "no_grf")
         self.recurrent_fusion = RecurrentFusion(c.gru, highway=c.variant != "no_highway")
-        self.action_head = MLP((*c.actor, self.num_actions), scale=_HEAD_SCALE)
+        self.action_head = MLP((*c.actor, self.num_actions), scale=HEAD_SCALE)
         std = nn.initializers.constant(math.log(c.initial_std))
         self.log_std = self.param("log_std", std, (self.num_actions,))
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cref_jax.network import recurrent
 
+HEAD_SCALE = 0.01  # of the action head's last layer; assumed: the first actions are near zero
 _EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's default
 
 

@@ -37,7 +37,7 @@ def build_manifest(policy: TrainedPolicy, driven: robot.Robot) -> dict[str, Any]
         "action": _action(c),
         "observation": _observation(policy.train, driven),
         "command": _command(c),
-        "depth": None if c.network.variant == "blind" else _depth(c),
+        "depth": _depth(c) if c.network.sees else None,
         "network": _network(c.network),
         "state": _state(c.network),
         "guards": _guards(driven),

@@ -31,8 +31,12 @@ def write(policy: TrainedPolicy, world: World, out: Path) -> None:
     """Write the directory, and a .zip of the same files beside it.
 
     Raises:
-        ConfigError: a file cannot be written, or another file is in its place.
+        ConfigError: a file cannot be written, another file is in its place, or it sees what no
+            robot does.
     """
+    variant = policy.config.network.variant
+    if variant not in deploy.VARIANTS:
+        raise ConfigError(f"{variant} sees the ground's heights, which no robot measures")
     arrays = pytree_digest.on_host(policy.train.params.actor["params"])
     weights = {name: x.astype(np.float32) for name, x in arrays.items()}
     files = {

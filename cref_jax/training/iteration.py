@@ -137,7 +137,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
 def partition(world: World) -> RunState:
     """Return the partition specs of a run's state: robots are sharded, the rest is replicated."""
     c = world.config
-    robots = rollout.partition(AXIS, c.network.variant, c.ppo.mirror_weight > 0.0)
+    robots = rollout.partition(AXIS, c.network, c.ppo.mirror_weight > 0.0)
     return RunState(train=P(), robots=robots, ramp=P())
 
 

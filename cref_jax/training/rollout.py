@@ -47,7 +47,7 @@ class Robots:
 class Modules(NamedTuple):
     """The trained modules."""
 
-    actor: network.Actor
+    actor: network.Actor | network.ParkourActor
     critic: network.Critic
     mirror: ppo.Mirror | None = None  # symmetry taught to the actor, if any
 
@@ -78,22 +78,22 @@ class Trace(NamedTuple):
     measures: environment.Measures
 
 
-def partition(axis: str, variant: config.Variant, has_twin: bool = False) -> Robots:
+def partition(axis: str, c: config.Network, has_twin: bool = False) -> Robots:
     """Return the partition spec of each array over the robots' `axis`; clocks are replicated."""
-    sees, robots = variant != "blind", P(axis)
-    memory = Memory(robots, P(None, axis) if sees else None)
+    robots = P(axis)
+    memory = Memory(robots, P(None, axis) if c.sees else None)
     return Robots(
         env=robots,
         observation=robots,
         memory=memory._replace(twin=memory if has_twin else None),
         begins=robots,
-        feed=CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P()) if sees else None,
+        feed=CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P()) if c.sees else None,
     )
 
 
 def networks(c: config.Network, num_actions: int) -> Modules:
     """Build the actor and the critic."""
-    return Modules(network.Actor(c, num_actions), network.Critic(c))
+    return Modules(network.build_actor(c, num_actions), network.Critic(c))
 
 
 def initial_params(
@@ -104,9 +104,10 @@ def initial_params(
     one = lambda x: x[None, :1]
     observation, begins = robots.observation, one(robots.begins)
     carry, nets = network.initial_carry(c.network, 1), networks(c.network, num_actions)
-    sight = robots.feed and network.DepthInput(
-        one(robots.feed.frame), jnp.zeros_like(begins, jnp.int32), begins
-    )
+    sight = observation.heights if observation.heights is None else one(observation.heights)
+    if robots.feed is not None:
+        held = jnp.zeros_like(begins, jnp.int32)
+        sight = network.DepthInput(one(robots.feed.frame), held, begins)
     (_, output), actor = nets.actor.init_with_output(
         key_actor, carry, one(observation.proprioception), begins, sight
     )
@@ -136,7 +137,7 @@ def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots
     """Wrap environment states as robots with empty memory and cameras; `keys`: one per robot."""
     c, num_envs = world.config, state.kind.shape[0]
     observation = jax.vmap(environment.observe, in_axes=(None, 0, 0))(world, state, keys)
-    sees = c.network.variant != "blind"
+    sees = c.network.sees
     return Robots(
         env=state,
         observation=observation,
@@ -169,13 +170,12 @@ def apply_policy(
     A frame is encoded when it arrives, and its features are held until the next one. If symmetry is
     taught, the mirrored policy gets the mirrored inputs and keeps its own memory.
     """
-    obs, feed, memory = robots.observation.proprioception, robots.feed, robots.memory
-    after, output = _apply_actor(nets, train, robots.begins, obs, feed, memory)
+    observation, feed, memory = robots.observation, robots.feed, robots.memory
+    after, output = _apply_actor(nets, train, robots.begins, observation, feed, memory)
     if nets.mirror is not None and memory.twin is not None:
         reflected = feed and feed.replace(frame=nets.mirror.frames(feed.frame))
-        twin, _ = _apply_actor(
-            nets, train, robots.begins, nets.mirror.obs(obs), reflected, memory.twin
-        )
+        seen = observation._replace(proprioception=nets.mirror.obs(observation.proprioception))
+        twin, _ = _apply_actor(nets, train, robots.begins, seen, reflected, memory.twin)
         after = after._replace(twin=twin)
     return after, output
 
@@ -184,14 +184,14 @@ def _apply_actor(
     nets: Modules,
     train: ppo.TrainState,
     begins: Bool[Array, " E"],
-    proprioception: Float[Array, "E O"],
+    observation: Observation,
     feed: CameraFeed | None,
     memory: Memory,
 ) -> tuple[Memory, network.Output]:
     """Apply the actor with one memory, encoding a frame if it is fresh."""
     params, features = train.params.actor, memory.features
-    obs = ppo.normalize(train.statistics.obs, proprioception)
-    view = None
+    obs = ppo.normalize(train.statistics.obs, observation.proprioception)
+    view = None if observation.heights is None else observation.heights[None]
     if feed is not None:
         encode = lambda: nets.actor.apply(params, feed.frame[None], method="encode")
         features = jax.lax.cond(feed.fresh, encode, lambda: features)
@@ -320,7 +320,7 @@ def _to_rollout(
     value = lambda s: nets.critic.apply(
         train.params.critic, ppo.normalize(train.statistics.critic_obs, s)
     )
-    outcome, sight = steps.outcome, None
+    outcome, sight = steps.outcome, steps.observation.heights
     if frames is not None and steps.frame_valid is not None:
         index = jnp.broadcast_to(steps.frame_index[:, None], steps.frame_valid.shape)
         hold = depth.longest_hold(c.camera, c.physics.control_period)

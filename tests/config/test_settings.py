@@ -71,6 +71,10 @@ def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
         ({"ppo": {"learning_rate": float("nan")}}, "--ppo.learning-rate must be .*, not nan"),
         ({"foothold": {"stride": 0}}, "--foothold.stride must be 1 to 1000, not 0"),
         ({"scan": {"x": [0.0, 1.0, 0]}}, "--scan.x must be from, to, samples"),
+        (
+            {"network": {"variant": "hpl_teacher"}, "ppo": {"mirror_weight": 1.0}},
+            "--ppo.mirror-weight must be 0 with --network.variant hpl_teacher",
+        ),
         ({"run": {"seed": 2**32}}, "--run.seed must be 0 to 4294967295"),
     ],
 )

@@ -66,6 +66,19 @@ def test_the_update_recomputes_the_actions_that_were_taken(seeing):
         np.testing.assert_allclose(out.mean, r.mean, atol=1e-6)
 
 
+def test_a_teacher_without_camera_recomputes_its_actions_from_heights():
+    _, nets, train, (before, _, _), horizons = two_horizons("hpl_teacher")
+    assert before.feed is None and before.memory.features is None
+    act = jax.jit(nets.functions.actor)
+    for r in horizons:
+        assert r.begins[1:].any() and r.sight.shape == (T, E, 21 * 11)
+        obs = ppo.normalize(train.statistics.obs, r.obs)
+        _, out = act(train.params.actor, r.carry, obs, r.begins, r.sight)
+        np.testing.assert_allclose(out.mean, r.mean, atol=1e-6)
+        _, level = act(train.params.actor, r.carry, obs, r.begins, jnp.zeros_like(r.sight))
+        assert np.abs(level.mean - r.mean).max() > 1e-5
+
+
 def test_frames_come_at_20_hz_and_each_is_stored_once(seeing):
     world, _, _, robots, horizons = seeing
     steps = np.concatenate([np.asarray(r.sight.held[:, 0]) for r in horizons])
