@@ -52,7 +52,8 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{options.out}: {size:.1f} MB; outputs match the trained network")
         print("\n".join(deploy.report(times)))
         print(f"on the robot: python {options.out}/cref_runtime.py --selftest {options.out}")
-        print(f"in C: cc -std=c99 -O2 -c {options.out}/cref_policy.c")
+        if (options.out / "cref_policy.c").is_file():
+            print(f"in C: cc -std=c99 -O2 -c {options.out}/cref_policy.c")
 
 
 def _export(options: Options) -> None:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cref_jax import cli, config
-from cref_jax.config import Config
+from cref_jax.config import Config, presets
 from cref_jax.env.world import build_world
 from cref_jax.training import iteration
 
@@ -30,8 +30,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def count_parameters(variant: config.Variant) -> dict[str, int]:
-    """Count the parameters of each module of the actor, and of the critic."""
-    c = config.override(Config(), {"network": {"variant": variant}, "run": {"num_envs": 4}})
+    """Count the parameters of each module of the actor, and of the critic, in its experiment."""
+    c = config.override(presets.apply_file(Config(), variant), {"run": {"num_envs": 4}})
     params = jax.eval_shape(iteration.initial_state, build_world(c)).train.params
     size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))
     parts = {part: size(tree) for part, tree in params.actor["params"].items()}

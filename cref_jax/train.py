@@ -29,7 +29,16 @@ from cref_jax.robot import ROBOTS, fill_in
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
-from cref_jax.training import devices, iteration, processes, resumption, run_dir, trainer, wandb_log
+from cref_jax.training import (
+    devices,
+    distillation,
+    iteration,
+    processes,
+    resumption,
+    run_dir,
+    trainer,
+    wandb_log,
+)
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
@@ -141,6 +150,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     init = command.options.init and sources.find_policy(command.options.init)
     options = dataclasses.replace(command.options, device=options.device, init=init)
     c = fill_in(_with_short_options(command.settings, options), options.robot)
+    c = distillation.fill_in(c)
     if options.resume:
         sources.check_robot(options.run_dir or Path(), c.robot.name)
     if init:
@@ -202,14 +212,49 @@ def train(options: Options, c: Config) -> None:
                 if processes.is_first() and map_files.is_map(c.terrain.name):
                     map_plot.draw_map(world.lanes.tile(0, 0), run / "map.png")
                     report.say(f"the map, with the start: {run / 'map.png'}")
-                programs = Programs(world, mesh, report)
-                if first < c.run.iterations:
-                    programs.get(min(c.run.chunk, c.run.iterations - first))
-                state = _first_state(world, mesh, steps, options)
-                state = trainer.run_chunks(world, state, steps, report, programs)
+                state = _run_stages(world, mesh, steps, report, options)
         processes.leave()
         if processes.is_first():
             _summary(run, c, state, options)
+
+
+def _run_stages(
+    world: World,
+    mesh: Mesh,
+    steps: Checkpoints,
+    report: Reporter | SilentReporter,
+    options: Options,
+) -> iteration.RunState:
+    """Train the policy; one that learns from a teacher, after its teacher."""
+    if world.config.network.variant != "hpl":
+        return _run_stage(world, mesh, steps, report, options)
+    taught = world.replace(config=distillation.teacher_config(world.config))
+    last = taught.config.run.iterations
+    if (steps.latest() or 0) > last:
+        return _run_stage(world, mesh, steps, report, options)
+    state = _run_stage(taught, mesh, steps, report, options)
+    if int(state.train.iteration) < last:
+        return state
+    report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")
+    programs = Programs(world, mesh, report)
+    state = iteration.start_student(world, state, mesh)
+    return trainer.run_chunks(world, state, steps, report, programs)
+
+
+def _run_stage(
+    world: World,
+    mesh: Mesh,
+    steps: Checkpoints,
+    report: Reporter | SilentReporter,
+    options: Options,
+) -> iteration.RunState:
+    """Train from the first state, or from the newest checkpoint, to the last iteration."""
+    c, first = world.config, steps.latest() or 0
+    programs = Programs(world, mesh, report)
+    if first < c.run.iterations:
+        programs.get(min(c.run.chunk, c.run.iterations - first))
+    state = _first_state(world, mesh, steps, options)
+    return trainer.run_chunks(world, state, steps, report, programs)
 
 
 def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Reporter | SilentReporter:
@@ -217,7 +262,8 @@ def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Report
     if not processes.is_first():
         return SilentReporter()
     run_dir.write_config(run, c)
-    run_dir.write_origin(run, first, c.terrain.name, resolve_engine(options.engine))
+    stages = distillation.samples_by_stage(c, first)
+    run_dir.write_origin(run, first, c.terrain.name, resolve_engine(options.engine), stages)
     samples = c.run.num_envs * c.ppo.horizon
     wandb = dataclasses.asdict(c) if options.wandb else None
     return Reporter(run, first, c.run.iterations, samples, options.tensorboard, wandb)
@@ -295,7 +341,9 @@ def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[s
 
 
 def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:
-    """Print the evaluation and the next command."""
+    """Print the samples of each stage, the evaluation and the next command."""
+    if c.network.variant == "hpl":
+        print(f"trained for {trained.describe_samples(c, int(state.train.iteration))}")
     if options.evaluate and int(state.train.iteration) >= c.run.iterations:
         print("evaluating 100 episodes on flat ground ...", flush=True)
         physics = build_physics(c, options.engine)
@@ -321,6 +369,8 @@ def _with_init(c: Config, options: Options) -> Config:
     """
     if options.resume:
         raise ConfigError("give --init or --resume, not both")
+    if c.network.variant == "hpl":
+        raise ConfigError("--init: a run of --network.variant hpl begins with a teacher of its own")
     sources.check_robot(options.init or Path(), c.robot.name)
     theirs, ours = sources.read_config(options.init or Path()).network, c.network
     for name, value in dataclasses.asdict(theirs).items():

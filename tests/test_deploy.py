@@ -54,7 +54,7 @@ def test_it_says_what_the_network_says_over_1000_steps_with_resets(variant):
         trained.config.network, trained.train, ROBOT, trained.config.robot, steps
     )
     expected = {name: np.asarray(x) for name, x in expected.items()}
-    assert len(expected) == {"blind": 11, "no_cross_attention": 14}.get(variant, 15)
+    assert len(expected) == {"blind": 11, "no_cross_attention": 14, "hpl": 6}.get(variant, 15)
     for t in range(1000):
         if steps.reset[t]:
             ours.reset()

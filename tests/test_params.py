@@ -25,6 +25,12 @@ def test_the_count_of_each_variant_is_that_of_its_layers():
     # 21 x 11 heights to 128, 64 and 32; with 45 numbers of proprioception to 3 gates of 256
     teacher, gates = counts["hpl_teacher"], 3 * 256
     assert teacher["height_encoder"] == (231 * 128 + 128) + (128 * 64 + 64) + (64 * 32 + 32)
+    # 48 x 64 by 5 x 5 to 44 x 60, pooled to 22 x 30; by 4 x 4 to 19 x 27, pooled to 9 x 13; by
+    # 3 x 3 to 7 x 11
+    filters = (25 * 16 + 16) + (16 * 16 * 32 + 32) + (9 * 32 * 32 + 32)
+    latent = (7 * 11 * 32 * 128 + 128) + (128 * 32 + 32)
+    assert counts["hpl"]["depth_encoder"] == filters + latent
+    assert counts["hpl"]["gru"] == teacher["gru"]
     assert teacher["gru"] == (45 + 32) * gates + gates + 256 * gates + 256
     table = params.build_table(counts)
     assert [str(column.header) for column in table.columns] == ["part", *counts]

@@ -136,6 +136,51 @@ def test_an_error_between_two_chunks_loses_nothing(tmp_path, monkeypatch, error)
     assert Checkpoints(tmp_path / "run" / "checkpoints").latest() == 2
 
 
+TWO_STAGES = ["--network.variant", "hpl", "--distillation.teacher-iterations", "2"]
+TWO_STAGES += ["--iterations", "4"]
+
+
+@pytest.mark.slow
+def test_a_run_of_two_stages_goes_on_from_either_bit_for_bit_and_walks_in_numpy(
+    tmp_path, monkeypatch, capsys
+):
+    run(tmp_path / "straight", *TWO_STAGES)
+    said = capsys.readouterr().out
+    assert "the teacher is done after 0.0 M samples" in said
+    assert "trained for 0.0 M samples (0.0 M by the teacher, 0.0 M by the student)" in said
+    whole = Reporter.chunk
+    for stopped in (1, 3):
+
+        def chunk(report, done, log, seconds, last=stopped):
+            whole(report, done, log, seconds)
+            if done + 1 == last:
+                raise OSError(28, "No space left on device")
+
+        folder = tmp_path / f"stopped-{stopped}"
+        with monkeypatch.context() as patch, pytest.raises(SystemExit):
+            patch.setattr(Reporter, "chunk", chunk)
+            run(folder, *TWO_STAGES)
+        assert Checkpoints(folder / "checkpoints").latest() == stopped
+        if stopped == 1:
+            with pytest.raises(ConfigError, match="no student yet, its teacher 1 of 2 iterations"):
+                trained.load_policy(folder, build_world(run_dir.read_config(folder)))
+        run(folder, "--resume")
+        straight, halves = state_of(tmp_path / "straight"), state_of(folder)
+        assert all(np.array_equal(a, b) for a, b in zip(straight, halves, strict=True))
+    starts = [json.loads(line) for line in (folder / "origin.jsonl").open()]
+    # of 8 robots in 24 steps
+    assert [start["samples"] for start in starts] == [
+        {"teacher": 0, "student": 0},
+        {"teacher": 2 * 192, "student": 192},
+    ]
+    export.main(["--run", str(folder), "--out", str(tmp_path / "policy")])
+    assert "outputs match the trained network" in capsys.readouterr().out
+    assert not (tmp_path / "policy" / "cref_policy.c").exists()
+    manifest = json.loads((tmp_path / "policy" / "manifest.json").read_text())
+    stages = {"teacher": 2 * 192, "student": 2 * 192}
+    assert manifest["provenance"]["samples_by_stage"] == stages
+
+
 @pytest.mark.slow
 def test_what_is_not_sound_is_not_saved(tmp_path, monkeypatch):
     def chunk(report, done, log, seconds):

@@ -1,6 +1,6 @@
 """Every number of the program, and how a run changes them."""
 
-from cref_jax.config.learning import PPO, Network, Run, Variant
+from cref_jax.config.learning import HPL, PPO, Distillation, Network, Run, Variant
 from cref_jax.config.overrides import describe_unknown, load_toml, override
 from cref_jax.config.settings import Config
 from cref_jax.config.simulation import Camera, Foothold, Physics, Robot, Scan, Terrain
@@ -8,12 +8,14 @@ from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Re
 from cref_jax.errors import ConfigError
 
 __all__ = [
+    "HPL",
     "PPO",
     "Camera",
     "Command",
     "Config",
     "ConfigError",
     "Curriculum",
+    "Distillation",
     "Episode",
     "Foothold",
     "Network",

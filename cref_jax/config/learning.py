@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 from typing import Literal
 
-Variant = Literal["full", "no_cross_attention", "no_grf", "no_highway", "blind", "hpl_teacher"]
+Variant = Literal[
+    "full", "no_cross_attention", "no_grf", "no_highway", "blind", "hpl_teacher", "hpl"
+]
+HPL = ("hpl_teacher", "hpl")  # teacher and student of Humanoid Parkour Learning
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,14 @@ class PPO:
     max_gradient_norm: float = 1.0
     average: int = 200  # iterations, at most, over which the kept policy is averaged; assumed
     critic_first: int = 0  # iterations in which the critic alone learns; for a run with --init
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """How a student of variant hpl learns, in a run whose first iterations are its teacher's."""
+
+    teacher_iterations: int = 0  # in which PPO trains the teacher; 0: seven tenths of the run's
+    learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ The ranges exclude what cannot run, cannot learn or is a slip of the pen, and no
 
 import math
 
+from cref_jax.config.learning import HPL
 from cref_jax.config.ranges import Ranges, Rising, Samples, Within, check_ranges
 from cref_jax.config.settings import Config
 from cref_jax.errors import ConfigError
@@ -211,6 +212,10 @@ RANGES: Ranges = {
         "average": Within(0, 1_000_000),
         "critic_first": Within(0, 1_000_000),
     },
+    "distillation": {
+        "teacher_iterations": Within(0, 10_000_000),
+        "learning_rate": Within(1e-8, 1),
+    },
 }
 
 
@@ -227,6 +232,7 @@ def check(c: Config) -> None:
     _check_footholds(c)
     _check_camera(c)
     _check_mirror(c)
+    _check_stages(c)
 
 
 def _check_minibatches(c: Config) -> None:
@@ -296,9 +302,24 @@ def _check_camera(c: Config) -> None:
                 f"--camera.shape: {size} {what} do not split into blocks of {blocks} x {blocks} "
                 f"pixels; take {near}"
             )
+        for _, kernel, pool in c.network.convolutions if c.network.variant == "hpl" else ():
+            size = (size - kernel + 1) // pool
+            if size < 1:
+                raise ConfigError(f"--network.convolutions leave no pixel of the {what}")
 
 
 def _check_mirror(c: Config) -> None:
     """Refuse a symmetry loss of an actor whose inputs have no mirror here."""
-    if c.ppo.mirror_weight and c.network.variant == "hpl_teacher":
-        raise ConfigError("--ppo.mirror-weight must be 0 with --network.variant hpl_teacher")
+    if c.ppo.mirror_weight and c.network.variant in HPL:
+        raise ConfigError(
+            f"--ppo.mirror-weight must be 0 with --network.variant {c.network.variant}"
+        )
+
+
+def _check_stages(c: Config) -> None:
+    """Refuse a run that leaves no iteration to the student."""
+    first, last = c.distillation.teacher_iterations or 1, c.run.iterations
+    if c.network.variant == "hpl" and first >= last:
+        raise ConfigError(
+            f"--distillation.teacher-iterations must be below --run.iterations, {last}, not {first}"
+        )

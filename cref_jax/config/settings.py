@@ -7,7 +7,7 @@ Defaults are the paper's. A run changes them by a TOML file of differences or on
 
 from dataclasses import dataclass, field
 
-from cref_jax.config.learning import PPO, Network, Run
+from cref_jax.config.learning import PPO, Distillation, Network, Run
 from cref_jax.config.simulation import Camera, Foothold, Physics, Robot, Scan, Terrain
 from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Reward
 
@@ -30,3 +30,4 @@ class Config:
     foothold: Foothold = field(default_factory=Foothold)
     network: Network = field(default_factory=Network)
     ppo: PPO = field(default_factory=PPO)
+    distillation: Distillation = field(default_factory=Distillation)

@@ -74,7 +74,7 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     )
     ground, qpos = _ground(world, state), state.body.qpos
     scan = observations.height_scan(ground, qpos, c.scan)
-    taught = c.network.variant == "hpl_teacher"
+    taught = c.network.variant in config.HPL
     hidden = _hidden_state(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),

@@ -1,7 +1,7 @@
 """The actor and the critic (Sec. II-B)."""
 
 from cref_jax.network.actor_critic import Actor, Critic
-from cref_jax.network.parkour import ParkourActor
+from cref_jax.network.parkour import DEPTH_MLP, ParkourActor
 from cref_jax.network.records import (
     Carry,
     DepthInput,
@@ -17,6 +17,7 @@ from cref_jax.network.records import (
 from cref_jax.network.variants import build_actor
 
 __all__ = [
+    "DEPTH_MLP",
     "Actor",
     "Carry",
     "Critic",

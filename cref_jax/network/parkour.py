@@ -1,7 +1,7 @@
 """The policy of Humanoid Parkour Learning (Zhuang et al. 2024, arXiv 2406.10759).
 
-A privileged teacher sees the heights of the ground around it. Widths are those of the authors'
-code for quadrupeds; that for humanoids was never released.
+A privileged teacher sees the heights of the ground around it, its student a depth image. Widths are
+those of the authors' code for quadrupeds; that for humanoids was never released.
 """
 
 import math
@@ -11,26 +11,66 @@ from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
 from cref_jax import config
-from cref_jax.network.layers import GRU, HEAD_SCALE, MLP
-from cref_jax.network.records import Carry, Output
+from cref_jax.network import patches, records
+from cref_jax.network.frame_slots import repeat_frames
+from cref_jax.network.layers import GRU, HEAD_SCALE, MLP, dense, elu
+from cref_jax.network.records import Carry, DepthInput, EncodedInput, Features, Output
 
 _HEIGHT_MLP = (128, 64)  # hidden widths; the latent after them is as wide as C_psi(D), 32
+DEPTH_MLP = (128,)  # hidden width after the filters; the latent is as wide as the teacher's
 _HEIGHT_SCALE = 5.0  # 1/m; legged_gym's, so that steps of 20 cm are near 1
+
+
+class PooledFilter(nn.Module):
+    """A convolution without padding, then the largest of each block of pool x pool, then ELU."""
+
+    channels: int
+    kernel: int
+    pool: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "K E H W I"]) -> Float[Array, "K E h w O"]:
+        """Filter images; rows and columns that fill no block are left out."""
+        height, width = (side - self.kernel + 1 for side in x.shape[2:4])
+        shifts = [(i, j) for i in range(self.kernel) for j in range(self.kernel)]
+        near = [x[:, :, i : i + height, j : j + width] for i, j in shifts]
+        y = dense(self.channels, name="filter")(jnp.concatenate(near, axis=-1))
+        rows, columns = height // self.pool, width // self.pool
+        y = y[:, :, : rows * self.pool, : columns * self.pool]
+        blocks = y.reshape(*y.shape[:2], rows, self.pool, columns, self.pool, self.channels)
+        return elu(blocks.max(axis=(3, 5)))
+
+
+class DepthEncoder(nn.Module):
+    """The latent of a depth image: filters, each pooled by its stride, then dense layers."""
+
+    c: config.Network
+
+    @nn.compact
+    def __call__(self, frames: Float[Array, "K E rows columns pixels"]) -> Float[Array, "K E C"]:
+        """Encode the frames."""
+        x = patches.to_image(frames[..., None], records.strides(self.c))
+        for i, (channels, kernel, pool) in enumerate(self.c.convolutions):
+            x = PooledFilter(channels, kernel, pool, name=f"layer_{i}")(x)
+        return MLP((*DEPTH_MLP, self.c.compressed), name="latent")(x.reshape(*x.shape[:2], -1))
 
 
 class ParkourActor(nn.Module):
     """A latent of what is ahead and proprioception into a GRU, its feature into the action head.
 
-    It does not estimate its velocity: the estimate is 0, and so is its gradient.
+    It does not estimate its velocity: the estimate is 0, as are its gradient and an LSTM's memory.
     """
 
     c: config.Network
     num_actions: int
 
     def setup(self) -> None:
-        """Create the submodules."""
+        """Create the submodules: teacher and student differ in the encoder alone."""
         c = self.c
-        self.height_encoder = MLP((*_HEIGHT_MLP, c.compressed))
+        if c.variant == "hpl":
+            self.depth_encoder = DepthEncoder(c)
+        else:
+            self.height_encoder = MLP((*_HEIGHT_MLP, c.compressed))
         self.gru = GRU(c.gru)
         self.action_head = MLP((*c.actor, self.num_actions), scale=HEAD_SCALE)
         std = nn.initializers.constant(math.log(c.initial_std))
@@ -41,7 +81,7 @@ class ParkourActor(nn.Module):
         carry: Carry,
         obs: Float[Array, "T E O"],
         begins: Bool[Array, "T E"],
-        sight: Float[Array, "T E G"],
+        sight: DepthInput | Float[Array, "T E G"],
     ) -> tuple[Carry, Output]:
         """Compute the memory after the last step, and the outputs of all steps.
 
@@ -49,19 +89,34 @@ class ParkourActor(nn.Module):
             carry: the memory before the first step.
             obs: o^p, normalised (Eq. 2).
             begins: the step is the first of an episode; the memory is cleared before it.
-            sight: heights of the base above the ground, m.
+            sight: a student's frames, each encoded once; a teacher's heights of the base above the
+                ground, m.
         """
+        if isinstance(sight, DepthInput):
+            encoded = self.encode(sight.frames)
+            return self.decide(
+                carry, obs, begins, EncodedInput(encoded, sight.held, sight.seen, sight.hold)
+            )
         return self.decide(carry, obs, begins, sight)
+
+    def encode(self, frames: Float[Array, "K E rows columns pixels"]) -> Features:
+        """Encode the frames: a latent of each, which is its one token, too."""
+        latent = self.depth_encoder(frames.astype(jnp.float32))
+        return Features(latent[:, :, None], latent)
 
     def decide(
         self,
         carry: Carry,
         obs: Float[Array, "T E O"],
         begins: Bool[Array, "T E"],
-        view: Float[Array, "T E G"],
+        view: EncodedInput | Float[Array, "T E G"],
     ) -> tuple[Carry, Output]:
-        """Compute the same as `__call__`."""
-        latent = self.height_encoder(_HEIGHT_SCALE * view)
+        """Compute the same as `__call__` from encoded frames; before the first the latent is 0."""
+        if isinstance(view, EncodedInput):
+            latent = repeat_frames(view.features.compressed, view.holding)
+            latent = jnp.where(view.seen[..., None], latent, 0.0)
+        else:
+            latent = self.height_encoder(_HEIGHT_SCALE * view)
         gru, h = self.gru(carry.gru, jnp.concatenate([obs, latent], axis=-1), begins)
         log_std = jnp.maximum(self.log_std, math.log(max(self.c.min_std, 1e-9)))
         velocity = jnp.zeros((*h.shape[:2], 3))

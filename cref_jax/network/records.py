@@ -79,9 +79,11 @@ def initial_carry(c: config.Network, num_envs: int) -> Carry:
 def zero_features(c: config.Network, image: tuple[int, int], num_envs: int) -> Features:
     """Create zero features with the shape of one encoded image per robot."""
     shrink = math.prod(stride for _, _, stride in c.convolutions)
-    tokens = math.prod(side // shrink for side in image)
+    tokens = math.prod(side // shrink for side in image), c.token
+    if c.variant == "hpl":
+        tokens = 1, c.compressed
     return Features(
-        tokens=jnp.zeros((1, num_envs, tokens, c.token)),
+        tokens=jnp.zeros((1, num_envs, *tokens)),
         compressed=jnp.zeros((1, num_envs, c.compressed)),
     )
 

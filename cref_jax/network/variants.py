@@ -7,5 +7,5 @@ from cref_jax.network.parkour import ParkourActor
 
 def build_actor(c: config.Network, num_actions: int) -> Actor | ParkourActor:
     """Build the actor of the variant."""
-    kind = ParkourActor if c.variant == "hpl_teacher" else Actor
+    kind = ParkourActor if c.variant in config.HPL else Actor
     return kind(c, num_actions)

@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from cref_jax.runtime import camera, cross_checks, policy, senses
+from cref_jax.errors import ConfigError
+from cref_jax.runtime import camera, cross_checks, network, policy, senses
 from cref_jax.runtime.status import FAULTS, STOPPING, WHY, Status
 
+NAMES = ("cref_policy.h", "cref_policy.c")
+VARIANTS = tuple(variant for variant in network.VARIANTS if variant != "hpl")
 _TEMPLATES = Path(__file__).parent / "c"
 _LIMITS: dict[ModuleType, tuple[str, ...]] = {
     policy: ("LATE", "STOP_AFTER", "START_AGAIN", "FAR", "START_SPEED", "STILL"),
@@ -29,7 +32,12 @@ def write_c(content: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str,
     """Write cref_policy.h and cref_policy.c of a manifest and its weights, by file name.
 
     Every `#include` of a file of `c/`, or of a part generated here, is replaced by its text.
+
+    Raises:
+        ConfigError: `network.c` does not have the network.
     """
+    if (variant := content["network"]["variant"]) not in VARIANTS:
+        raise ConfigError(f"C has the networks {', '.join(VARIANTS)}, not {variant}; use numpy")
     weights = {
         re.sub("recurrent$", "recurrent/kernel", name): np.asarray(x, np.float32)
         for name, x in sorted(arrays.items())
@@ -42,8 +50,7 @@ def write_c(content: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str,
         "status_text.c": _status_text(),
         "tables.c": _tables(content, weights),
     }
-    names = ("cref_policy.h", "cref_policy.c")
-    return {name: _include(name, parts).encode() for name in names}
+    return {name: _include(name, parts).encode() for name in NAMES}
 
 
 def _include(name: str, parts: dict[str, str]) -> str:

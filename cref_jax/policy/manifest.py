@@ -9,10 +9,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from cref_jax import config, deploy, ppo, robot
+from cref_jax import config, deploy, network, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import observations
 from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.training import distillation
 
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
 STALE = 0.1  # s, two camera frames
@@ -157,6 +158,7 @@ def _depth(c: Config) -> dict[str, Any]:
 
 def _network(c: config.Network) -> dict[str, Any]:
     keys = ("channels", "kernel", "stride")
+    of_variant = {"depth_mlp": list(network.DEPTH_MLP)} if c.variant == "hpl" else {}
     return {
         "variant": c.variant,
         "convolutions": [dict(zip(keys, layer, strict=True)) for layer in c.convolutions],
@@ -168,6 +170,7 @@ def _network(c: config.Network) -> dict[str, Any]:
         "actor": list(c.actor),
         "activation": "elu",
         "norm_epsilon": 1e-6,
+        **of_variant,
     }
 
 
@@ -198,6 +201,7 @@ def _guards(driven: robot.Robot) -> dict[str, Any]:
 def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
     """Describe the origin of the policy; the last start of its run represents all of them."""
     c, origin = policy.config, policy.run / "origin.jsonl"
+    stages = distillation.samples_by_stage(c, policy.iteration)
     lines = origin.read_text().splitlines() if origin.is_file() else []
     start = json.loads(lines[-1]) if lines else {"command": []}
     bare = lambda word: (
@@ -209,6 +213,7 @@ def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
         "run": policy.run.name,
         "iteration": policy.iteration,
         "samples": policy.samples,
+        **({"samples_by_stage": stages} if stages else {}),
         "trained_by": start,
         "config": json.loads(json.dumps(dataclasses.asdict(c))),
     }

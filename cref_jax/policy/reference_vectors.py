@@ -108,7 +108,7 @@ def compute_reference(
     steps: SensorLog,
 ) -> dict[str, Array]:
     """Compute the trained network's state and output after each step, named as in deploy.py."""
-    actor = network.Actor(c, robot.num_joints)
+    actor = network.build_actor(c, robot.num_joints)
     start = _StepState(
         carry=network.initial_carry(c, 1),
         features=None,
@@ -122,7 +122,7 @@ def compute_reference(
 
 
 def _reference_step(
-    actor: network.Actor,
+    actor: network.Actor | network.ParkourActor,
     train: ppo.TrainState,
     robot: Robot,
     limits: config.Robot,
@@ -150,21 +150,36 @@ def _reference_step(
     action = jnp.clip(output.mean[0, 0], -limits.action_clip, limits.action_clip)
     part = {name: outputs["__call__"][0] for name, outputs in captured["intermediates"].items()}
     tensors = {
+        "gate": output.gate,
+        "action": output.mean,
+        "gru": carry.gru[None],
+        "previous_action": action[None, None],
+        "target": (robot.nominal_pose + robot.action_scale * action)[None, None],
+        **_inner_tensors(carry, features, frame_valid, part, output),
+    }
+    return _StepState(carry, features, frame_valid, action), {
+        k: x[0, 0] for k, x in tensors.items()
+    }
+
+
+def _inner_tensors(
+    carry: network.Carry,
+    features: network.Features | None,
+    frame_valid: Bool[Array, " 1"],
+    part: dict[str, Any],
+    output: network.Output,
+) -> dict[str, Array]:
+    """Collect the tensors that the variants do not have in common."""
+    if features is not None and "proprioceptive_tokenizer" not in part:  # hpl's
+        return {"compressed": jnp.where(frame_valid, features.compressed, 0.0)}
+    return {
         "velocity": output.velocity,
         "state_token": part["proprioceptive_tokenizer"],
         "fused": part["fusion"],
         "blended": part["recurrent_fusion"][1],
-        "gate": output.gate,
-        "action": output.mean,
         "lstm_c": carry.lstm_c[None],
         "lstm_h": carry.lstm_h[None],
-        "gru": carry.gru[None],
-        "previous_action": action[None, None],
-        "target": (robot.nominal_pose + robot.action_scale * action)[None, None],
         **_depth_tensors(features, frame_valid, part, output),
-    }
-    return _StepState(carry, features, frame_valid, action), {
-        k: x[0, 0] for k, x in tensors.items()
     }
 
 

@@ -7,7 +7,7 @@ from cref_jax.config import Config, folders
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, reader, trained
-from cref_jax.policy.trained import TrainedPolicy, count_samples
+from cref_jax.policy.trained import TrainedPolicy, describe_samples
 from cref_jax.robot.registry import describe as describe_robot
 from cref_jax.robot.registry import name_robot
 from cref_jax.training import run_dir
@@ -106,7 +106,7 @@ def summarize(path: Path) -> str:
 
 def _line(path: Path, c: Config, iteration: int) -> str:
     sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
-    samples = f"{count_samples(c, iteration) / 1e6:.1f} M samples"
+    samples = describe_samples(c, iteration)
     return f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {samples}"
 
 

@@ -8,7 +8,8 @@ import jax
 from cref_jax import ppo
 from cref_jax.config import Config
 from cref_jax.env.world import World
-from cref_jax.training import iteration, run_dir
+from cref_jax.errors import ConfigError
+from cref_jax.training import distillation, iteration, run_dir
 
 
 class TrainedPolicy(NamedTuple):
@@ -30,17 +31,32 @@ def count_samples(c: Config, iteration: int) -> int:
     return iteration * c.run.num_envs * c.ppo.horizon
 
 
+def describe_samples(c: Config, iteration: int) -> str:
+    """Say how many samples were seen, and by which stage of a run that has several."""
+    text = f"{count_samples(c, iteration) / 1e6:.1f} M samples"
+    stages = distillation.samples_by_stage(c, iteration)
+    each = ", ".join(f"{count / 1e6:.1f} M by the {name}" for name, count in stages.items())
+    return f"{text} ({each})" if each else text
+
+
 def load_policy(run: Path, world: World) -> TrainedPolicy:
     """Load the newest policy of a run; `world` may have another terrain than in training.
 
     Raises:
-        ConfigError: the run does not exist.
+        ConfigError: the run does not exist, or trains the teacher of its policy still.
         CheckpointError: it has no readable checkpoint.
     """
     like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
     c = run_dir.read_config(run)
     with run_dir.checkpoints(run) as steps:
         newest = steps.latest()
+        stages = distillation.samples_by_stage(c, newest or 0)
+        if newest and stages and not stages["student"]:
+            last = distillation.teacher_config(c).run.iterations
+            raise ConfigError(
+                f"{run} has no student yet, its teacher {newest} of {last} iterations; go on with "
+                "--resume"
+            )
         train = steps.restore_part("train", like, newest)
         return TrainedPolicy(c, with_averaged_actor(train), newest or 0, run)
 

@@ -4,7 +4,7 @@ manifest.json      everything but the weights, with units, frames and origin
 weights.npz        float32 by flat names, uncompressed
 testvectors.npz    reference inputs and outputs of the trained network
 cref_runtime.py    deploy.py and runtime/ as one file, which runs the policy with numpy alone
-cref_policy.c, .h  the policy in C99 with its weights, for a robot's own controller
+cref_policy.c, .h  the policy in C99 with its weights, for a robot's own controller; not for hpl
 """
 
 import hashlib
@@ -64,12 +64,15 @@ def _write_files(
 ) -> None:
     """Write the files and the runtimes, a manifest with their digests, and one .zip beside them."""
     files["cref_runtime.py"] = runtime_file.join_files()
-    files |= c_files.write_c(content, weights)
+    if content["network"]["variant"] in c_files.VARIANTS:
+        files |= c_files.write_c(content, weights)
     content["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     content["digest"] = deploy.manifest_digest(content)
     files["manifest.json"] = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for name in c_files.NAMES:  # of another policy
+            (out / name).unlink(missing_ok=True)
         for name, data in files.items():
             (out / name).write_bytes(data)
         out.with_name(out.name + ".zip").write_bytes(_zip_stored(files))

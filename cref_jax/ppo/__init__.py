@@ -1,7 +1,14 @@
 """Recurrent PPO, which knows nothing of robots."""
 
 from cref_jax.ppo.advantages import gae, prepare_batch, zero_invalid
-from cref_jax.ppo.learner import adapt_learning_rate, initial_state, minibatches, optimizer, update
+from cref_jax.ppo.learner import (
+    adapt_learning_rate,
+    average_share,
+    initial_state,
+    minibatches,
+    optimizer,
+    update,
+)
 from cref_jax.ppo.normalization import (
     OBSERVATION_CLIP,
     STD_RANGE,
@@ -42,6 +49,7 @@ __all__ = [
     "Statistics",
     "TrainState",
     "adapt_learning_rate",
+    "average_share",
     "gae",
     "initial_state",
     "initial_statistics",

@@ -87,6 +87,6 @@ def zero_invalid(rollout: Rollout) -> Rollout:
         valid = rollout.valid.reshape(rollout.valid.shape + (1,) * (x.ndim - 2))
         return jnp.where(valid, x, jnp.zeros_like(x))
 
-    untouched = {name: getattr(rollout, name) for name in ("carry", "sight", "twin")}
-    clean = jax.tree.map(keep, rollout._replace(carry=(), sight=(), twin=()))
+    untouched = {name: getattr(rollout, name) for name in ("carry", "sight", "twin", "guide")}
+    clean = jax.tree.map(keep, rollout._replace(carry=(), sight=(), twin=(), guide=()))
     return clean._replace(begins=rollout.begins, **untouched)

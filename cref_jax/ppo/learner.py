@@ -8,7 +8,7 @@ their stored memory. Samples that are not `valid` enter no loss and no statistic
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cref_jax import config
 from cref_jax.ppo import advantages, normalization
@@ -79,10 +79,15 @@ def update(
             state.statistics.critic_obs, rollout.critic_obs, rollout.valid, axis
         ),
     )
-    share = 1.0 / (1.0 + jnp.minimum(0.1 * state.iteration, c.average))
+    share = average_share(state.iteration, c)
     average = optax.incremental_update(state.params.actor, state.average, share)
     iteration = state.iteration + 1
     return state.replace(average=average, statistics=statistics, iteration=iteration), losses
+
+
+def average_share(iteration: Int[Array, ""], c: config.PPO) -> Float[Array, ""]:
+    """Compute the newest parameters' share of the average."""
+    return 1.0 / (1.0 + jnp.minimum(0.1 * iteration, c.average))
 
 
 def minibatches(batch: Batch, key: PRNGKeyArray, count: int) -> Batch:

@@ -104,6 +104,7 @@ class TrainState:
     opt_state: optax.OptState  # includes the learning rate and the count of bad gradients
     statistics: Statistics
     iteration: Int[Array | jax.ShapeDtypeStruct, "*seeds"]  # a ShapeDtypeStruct in eval_shape
+    teacher: PyTree = None  # parameters of the actor that this one learns from, if any
 
 
 class Rollout(NamedTuple):
@@ -125,3 +126,4 @@ class Rollout(NamedTuple):
     carry: PyTree[Float[Array, "E ?H"]]  # the actor's memory before the first step
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # further inputs of the actor, unnormalised
     twin: PyTree[Float[Array, "E ?H"]] = None  # memory of the mirrored actor before the first step
+    guide: PyTree[Shaped[Array, "T E *?n"]] = None  # what a teacher sees besides, unnormalised

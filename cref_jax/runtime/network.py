@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
+from cref_jax.runtime.layers import Dense, Gru, Mlp, Norm, read_convolutions, sigmoid
 from cref_jax.runtime.tables import PolicyFormatError, Table, Weights
 
-VARIANTS = ("full", "no_cross_attention", "no_grf", "no_highway", "blind")
+VARIANTS = ("full", "no_cross_attention", "no_grf", "no_highway", "blind", "hpl")
 
 
 class Encoder:
@@ -18,17 +17,17 @@ class Encoder:
         tokenizer = weights.under("depth_tokenizer")
         rows, columns = shape
         self._layers, channels = [], 1
-        for i, settings in enumerate(_read_convolutions(net, shape)):
+        for i, settings in enumerate(read_convolutions(net, shape)):
             weights_i = tokenizer.under(f"layer_{i}")
             self._layers.append(_Convolution(weights_i, (rows, columns, channels), *settings))
             rows, columns, channels = self._layers[-1].shape
         width = net.whole("token", 1, 4096)
-        self._projection = _Dense(tokenizer, "projection", channels, width, rows * columns)
+        self._projection = Dense(tokenizer, "projection", channels, width, rows * columns)
         self._place = tokenizer.take("place", rows * columns, width)
-        self._norm = _Norm(tokenizer, width)
+        self._norm = Norm(tokenizer, width)
         self._blocks = (shape[0] // 8, 8, shape[1] // 8, 8)
         blocks, out = self._blocks[0] * self._blocks[2], net.whole("compressed", 1, 4096)
-        self._compression = _Dense(weights, "depth_compression/layer_0", blocks, out, elu=True)
+        self._compression = Dense(weights, "depth_compression/layer_0", blocks, out, elu=True)
 
     def __call__(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the tokens [N, D] and the compressed depth [C] of D [H, W]."""
@@ -50,7 +49,7 @@ class Actor:
         variant, width = net.text("variant", VARIANTS), net.whole("token", 1, 4096)
         self._sees = variant != "blind"
         compressed = net.whole("compressed", 1, 4096) if self._sees else 0
-        shrink = [stride for _, _, stride in _read_convolutions(net, shape)] if self._sees else []
+        shrink = [stride for _, _, stride in read_convolutions(net, shape)] if self._sees else []
         tokens = int(np.prod(shape) // np.prod(shrink) ** 2) if self._sees else 0
         self._tokens = np.zeros((tokens, width), np.float32)
         self._query: _Attention | _Pooled | None = None
@@ -62,13 +61,13 @@ class Actor:
         hidden = net.whole("lstm", 1, 4096)
         self._lstm = _Lstm(weights.under("velocity_estimator"), size + compressed, hidden)
         known = size + 3, width, width
-        self._tokenizer = _Mlp(weights.under("proprioceptive_tokenizer"), known)
+        self._tokenizer = Mlp(weights.under("proprioceptive_tokenizer"), known)
         fused = 2 * width if self._sees else width
         self._fusion = _Fusion(weights.under("fusion"), fused, gated=variant != "no_grf")
         hidden, highway = net.whole("gru", 1, 4096), variant != "no_highway"
         self._memory = _Memory(weights.under("recurrent_fusion"), fused, hidden, highway)
         head = net.wholes("actor", 1, 8192)
-        self._head = _Mlp(weights.under("action_head"), (fused, *head, actions))
+        self._head = Mlp(weights.under("action_head"), (fused, *head, actions))
         weights.take("log_std", actions)  # needed only to continue training
         self._inputs = np.zeros(size + compressed, np.float32)
         self._known = np.zeros(size + 3, np.float32)
@@ -126,12 +125,12 @@ class _Attention:
         if width % heads:
             raise PolicyFormatError(f"{heads} heads do not divide a width of {width}")
         each = width // heads
-        self._norm = _Norm(weights, width)
-        self._query = _Dense(weights, "query", width, width, bias=False)
+        self._norm = Norm(weights, width)
+        self._query = Dense(weights, "query", width, width, bias=False)
         by_head = (width, heads, each)
         self._key = _copy(weights.take("key", width, width).reshape(by_head), (1, 2, 0))
         self._value = _copy(weights.take("value", width, width).reshape(by_head), (1, 0, 2))
-        self._output = _Dense(weights, "output", width, width, bias=False)
+        self._output = Dense(weights, "output", width, width, bias=False)
         self._shape, self._root = (heads, 1, each), np.float32(np.sqrt(each))
         self.weights = np.zeros((heads, tokens), np.float32)
 
@@ -152,7 +151,7 @@ class _Pooled:
     """The ablation of cross attention: the mean of the tokens."""
 
     def __init__(self, weights: Weights, width: int) -> None:
-        self._projection = _Dense(weights, "projection", width, width)
+        self._projection = Dense(weights, "projection", width, width)
 
     def __call__(self, state: np.ndarray, tokens: np.ndarray) -> np.ndarray:
         """Compute the projected mean [D]; the state is not used."""
@@ -163,9 +162,9 @@ class _Lstm:
     """The base's linear velocity (Eq. 7); gates in the order input, forget, candidate, output."""
 
     def __init__(self, weights: Weights, inputs: int, hidden: int) -> None:
-        self._input = _Dense(weights, "lstm/input", inputs, 4 * hidden)
+        self._input = Dense(weights, "lstm/input", inputs, 4 * hidden)
         self._recurrent = weights.take("lstm/recurrent", hidden, 4 * hidden)
-        self._velocity = _Dense(weights, "velocity", hidden, 3)
+        self._velocity = Dense(weights, "velocity", hidden, 3)
         self._gates = np.zeros(4 * hidden, np.float32)
         self.c, self.h = np.zeros(hidden, np.float32), np.zeros(hidden, np.float32)
 
@@ -175,7 +174,7 @@ class _Lstm:
         np.dot(self.h, self._recurrent, out=gates)
         gates += self._input(x)
         candidate = np.tanh(gates[2 * n : 3 * n])
-        _sigmoid(gates)
+        sigmoid(gates)
         self.c *= gates[n : 2 * n]
         self.c += gates[:n] * candidate
         np.tanh(self.c, out=self.h)
@@ -187,10 +186,10 @@ class _Fusion:
     """Gated residual fusion (Eq. 11-14)."""
 
     def __init__(self, weights: Weights, width: int, gated: bool) -> None:
-        self._norm = _Norm(weights, width)
-        self._mix = _Dense(weights, "mix", width, width, elu=True)
+        self._norm = Norm(weights, width)
+        self._mix = Dense(weights, "mix", width, width, elu=True)
         name, outputs = ("content_gate", 2 * width) if gated else ("content", width)
-        self._content = _Dense(weights, name, width, outputs)
+        self._content = Dense(weights, name, width, outputs)
         self._gated, self.out = gated, np.zeros(width, np.float32)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
@@ -198,44 +197,29 @@ class _Fusion:
         content = self._content(self._mix(self._norm(x)))
         if self._gated:
             content, gate = content[: len(x)], content[len(x) :]
-            content *= _sigmoid(gate)
+            content *= sigmoid(gate)
         return np.add(x, content, out=self.out)
 
 
 class _Memory:
-    """Recurrent fusion with a highway gate (Eq. 15-16); gates in the order reset, update, new."""
+    """Recurrent fusion with a highway gate (Eq. 15-16)."""
 
     def __init__(self, weights: Weights, width: int, hidden: int, highway: bool) -> None:
-        self._input = _Dense(weights, "gru/input", width, 3 * hidden)
-        self._recurrent = weights.take("gru/recurrent", hidden, 3 * hidden)
-        self._bias = weights.take("gru/candidate_bias", hidden)
-        self._out = _Dense(weights, "memory_out", hidden, width, bias=False)
-        self._gate = _Dense(weights, "gate", 2 * width, width) if highway else None
-        self._gates = np.zeros(3 * hidden, np.float32)
+        self._gru = Gru(weights.under("gru"), width, hidden)
+        self._out = Dense(weights, "memory_out", hidden, width, bias=False)
+        self._gate = Dense(weights, "gate", 2 * width, width) if highway else None
         self._both = np.zeros(2 * width, np.float32)
-        self.h, self.out = np.zeros(hidden, np.float32), np.zeros(width, np.float32)
+        self.h, self.out = self._gru.h, np.zeros(width, np.float32)
         self.gate = np.ones(width, np.float32)
 
     def __call__(self, f: np.ndarray) -> np.ndarray:
         """Compute y [D] of f [D] and update the memory."""
-        n, x, gates = len(self.h), self._input(f), self._gates
-        np.dot(self.h, self._recurrent, out=gates)
-        gates[: 2 * n] += x[: 2 * n]
-        reset, update = _sigmoid(gates[:n]), _sigmoid(gates[n : 2 * n])
-        candidate = gates[2 * n :]
-        candidate += self._bias
-        candidate *= reset
-        candidate += x[2 * n :]
-        np.tanh(candidate, out=candidate)
-        self.h -= candidate
-        self.h *= update
-        self.h += candidate  # (1 - u) n + u h
-        z = self._out(self.h)
+        z = self._out(self._gru(f))
         if self._gate is None:
             self.out[:] = z
             return self.out
         self._both[: len(f)], self._both[len(f) :] = z, f
-        self.gate = _sigmoid(self._gate(self._both))
+        self.gate = sigmoid(self._gate(self._both))
         np.subtract(z, f, out=self.out)
         self.out *= self.gate
         self.out += f  # b z + (1 - b) f
@@ -267,101 +251,13 @@ class _Convolution:
         )
         count, size = self.shape[0] * self.shape[1], kernel * kernel * depth
         self._patches = np.zeros((count, size), np.float32)
-        self._filter = _Dense(weights, "filter", size, channels, count, elu=True)
+        self._filter = Dense(weights, "filter", size, channels, count, elu=True)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Compute the filtered image [h, w, channels] of [H, W, depth]."""
         self._inside[:] = image
         self._patches.reshape(self._windows.shape)[:] = self._windows
         return self._filter(self._patches).reshape(self.shape)
-
-
-class _Mlp:
-    """Dense layers with ELU between them."""
-
-    def __init__(self, weights: Weights, widths: Sequence[int]) -> None:
-        self._layers = [
-            _Dense(weights, f"layer_{i}", a, b, elu=i < len(widths) - 2)
-            for i, (a, b) in enumerate(zip(widths, widths[1:]))
-        ]
-        self.out = self._layers[-1].out
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Compute the last layer's output."""
-        for layer in self._layers:
-            x = layer(x)
-        return x
-
-
-class _Dense:
-    """x W + b, then optionally ELU, in a buffer that the next call overwrites."""
-
-    def __init__(
-        self,
-        weights: Weights,
-        name: str,
-        inputs: int,
-        outputs: int,
-        rows: int = 0,
-        bias: bool = True,
-        elu: bool = False,
-    ) -> None:
-        self._kernel = weights.take(name + "/kernel", inputs, outputs)
-        self._bias = weights.take(name + "/bias", outputs) if bias else None
-        self.out = np.zeros((rows, outputs) if rows else outputs, np.float32)
-        self._below = np.zeros_like(self.out) if elu else None
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Compute the output of x [inputs] or [rows, inputs]."""
-        np.dot(x, self._kernel, out=self.out)
-        if self._bias is not None:
-            self.out += self._bias
-        if self._below is not None:
-            np.minimum(self.out, 0.0, out=self._below)
-            np.expm1(self._below, out=self._below)
-            np.maximum(self.out, 0.0, out=self.out)
-            self.out += self._below
-        return self.out
-
-
-class _Norm:
-    """Layer normalisation over the last axis."""
-
-    def __init__(self, weights: Weights, width: int) -> None:
-        self._scale = weights.take("norm/scale", width)
-        self._bias = weights.take("norm/bias", width)
-
-    def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Normalise x."""
-        centred = x - x.mean(axis=-1, keepdims=True)
-        variance = np.mean(centred * centred, axis=-1, keepdims=True)
-        centred *= self._scale / np.sqrt(variance + np.float32(1e-6))
-        centred += self._bias
-        return centred
-
-
-def _read_convolutions(net: Table, shape: tuple[int, int]) -> list[tuple[int, ...]]:
-    """Read channels, kernel and stride of each layer of the depth tokenizer."""
-    rows, columns = shape
-    layers = []
-    for i, layer in enumerate(net.tables("convolutions")):
-        settings = tuple(layer.whole(key, 1, 1024) for key in ("channels", "kernel", "stride"))
-        if rows % settings[2] or columns % settings[2]:
-            raise PolicyFormatError(f"layer {i} does not divide an image of {shape}")
-        rows, columns = rows // settings[2], columns // settings[2]
-        layers.append(settings)
-    if shape[0] % 8 or shape[1] % 8:
-        raise PolicyFormatError(f"an image of {shape} has no blocks of 8 x 8")
-    return layers
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    """Compute 1 / (1 + exp(-x)) in place."""
-    np.negative(x, out=x)
-    np.minimum(x, 80.0, out=x)  # keeps exp from overflowing; the result is below 2e-35 either way
-    np.exp(x, out=x)
-    x += 1.0
-    return np.reciprocal(x, out=x)
 
 
 def _copy(x: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:

@@ -17,7 +17,7 @@ from cref_jax.runtime.camera import Camera
 from cref_jax.runtime.files import contents, one_error
 from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
-from cref_jax.runtime.network import VARIANTS, Actor, Encoder
+from cref_jax.runtime.network import VARIANTS
 from cref_jax.runtime.nudge import Nudge
 from cref_jax.runtime.recorder import Recorder
 from cref_jax.runtime.senses import Senses
@@ -31,6 +31,7 @@ from cref_jax.runtime.status import (
     Status,
 )
 from cref_jax.runtime.tables import PolicyFormatError, Table, Weights
+from cref_jax.runtime.variants import build_actor, build_encoder
 
 TERMS = ("angular_velocity", "gravity", "command", "joint_position", "joint_velocity", "action")
 LATE = 2.0  # control periods between two steps, at most
@@ -110,8 +111,8 @@ class Policy:
         if not self.blind:
             self._camera = Camera(root.table("depth"), depth_scale, self._invalid)
             self.image_shape = self._camera.shape
-            self._encoder = Encoder(net, weights, self.image_shape)
-        self._actor = Actor(net, weights, self.image_shape, size, count)
+            self._encoder = build_encoder(net, weights, self.image_shape)
+        self._actor = build_actor(net, weights, self.image_shape, size, count)
         weights.finish()
         self._careful, self._start_after = careful, start_after
         legs = Legs(root, self.joints.names) if careful and root.has("legs") else None

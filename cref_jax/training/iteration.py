@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
-from cref_jax import ppo
+from cref_jax import config, ppo
 from cref_jax.env.world import World
 from cref_jax.ppo import Losses
-from cref_jax.training import mirror, randomization_ramp, rollout
+from cref_jax.training import distillation, mirror, randomization_ramp, rollout
 from cref_jax.training.randomization_ramp import Ramp
 
 Log = dict[str, Float[Array, "*n"]]  # by name, one number per iteration
@@ -51,6 +51,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
 
     def start(world: World, key: Array) -> rollout.Robots:
         robots = rollout.start(world, _device_key(key), c.run.num_envs // mesh.size)
+        robots = rollout.with_teachers(robots) if c.network.variant == "hpl" else robots
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
     sharded_start = jax.shard_map(
@@ -66,11 +67,41 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     params = rollout.initial_params(c, joints, robots, key_params)
     sizes = observation.proprioception.shape[-1], observation.privileged.shape[-1]
     train = ppo.initial_state(params, *sizes, c.ppo)
+    if c.network.variant == "hpl":
+        teacher = distillation.initial_teacher(c, joints, robots, key_params)
+        train = distillation.with_teacher(train, teacher, c)
     whole = NamedSharding(mesh, P())
     train, ramp = jax.lax.with_sharding_constraint(
         (train, randomization_ramp.initial_ramp(c.randomisation)), (whole, whole)
     )
     return RunState(train, robots, ramp)
+
+
+@functools.partial(jax.jit, static_argnames="mesh")
+def start_student(world: World, taught: RunState, mesh: Mesh) -> RunState:
+    """Begin the second stage of a run where the first has ended.
+
+    The teacher is the averaged one. The robots go on from where they are, with a new camera.
+    """
+    fresh = initial_state(world, mesh)
+    train = distillation.with_teacher(fresh.train, taught.train.average, world.config)
+    learned = taught.train.params
+    train = train.replace(
+        params=train.params._replace(critic=learned.critic, readout=learned.readout),
+        statistics=taught.train.statistics,
+        iteration=taught.train.iteration,
+    )
+    robots = fresh.robots.replace(
+        env=taught.robots.env,
+        observation=taught.robots.observation,
+        begins=taught.robots.begins,
+        memory=fresh.robots.memory._replace(teacher=taught.robots.memory.carry),
+    )
+    state = RunState(train, robots, taught.ramp)
+    place = lambda spec, part: jax.tree.map(
+        lambda x: jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec)), part
+    )
+    return jax.tree.map(place, partition(world), state, is_leaf=lambda x: isinstance(x, P))
 
 
 def state_shapes(world: World, mesh: Mesh) -> RunState:
@@ -101,11 +132,14 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     if c.ppo.mirror_weight:
         nets = nets._replace(mirror=mirror.make_mirror(world.physics.model, c.network))
 
-    def learn(world: World, state: RunState, key: Array) -> tuple[RunState, Losses, rollout.Trace]:
-        key_act, key_update = jax.random.split(_device_key(key))
+    def learn(
+        world: World, state: RunState, key: Array
+    ) -> tuple[RunState, Losses | distillation.Losses, rollout.Trace]:
         robots = rollout.with_randomization(state.robots, state.ramp.share)
-        robots, experience, trace = rollout.collect(world, nets, state.train, robots, key_act)
-        train, losses = ppo.update(state.train, experience, key_update, c.ppo, nets.functions, AXIS)
+        teach = distillation.learn if c.network.variant == "hpl" else _reinforce
+        train, robots, losses, trace = teach(
+            world, nets, state.train, robots, _device_key(key), AXIS
+        )
         return state.replace(train=train, robots=robots), losses, trace
 
     parts = partition(world)
@@ -130,14 +164,44 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         "train/action_std": std.mean(),
         "train/samples": samples.astype(jnp.float32),
         "train/randomisation": state.ramp.share,
+        **_stage_samples(c, samples),
     }
     return state, jax.lax.with_sharding_constraint(log, NamedSharding(mesh, P()))
+
+
+def _reinforce(
+    world: World,
+    nets: rollout.Modules,
+    train: ppo.TrainState,
+    robots: rollout.Robots,
+    key: Array,
+    axis: str,
+) -> tuple[ppo.TrainState, rollout.Robots, Losses, rollout.Trace]:
+    """Collect a horizon of experience and learn from it by PPO."""
+    key_act, key_update = jax.random.split(key)
+    robots, experience, trace = rollout.collect(world, nets, train, robots, key_act)
+    c = world.config.ppo
+    train, losses = ppo.update(train, experience, key_update, c, nets.functions, axis)
+    return train, robots, losses, trace
+
+
+def _stage_samples(c: config.Config, samples: Int[Array, ""]) -> Log:
+    """Log the samples of teacher and student, in the second stage."""
+    stages = distillation.samples_by_stage(c, c.run.iterations)
+    if not stages:
+        return {}
+    return {
+        "train/teacher_samples": jnp.float32(stages["teacher"]),
+        "train/student_samples": (samples - stages["teacher"]).astype(jnp.float32),
+    }
 
 
 def partition(world: World) -> RunState:
     """Return the partition specs of a run's state: robots are sharded, the rest is replicated."""
     c = world.config
-    robots = rollout.partition(AXIS, c.network, c.ppo.mirror_weight > 0.0)
+    robots = rollout.partition(
+        AXIS, c.network, c.ppo.mirror_weight > 0.0, c.network.variant == "hpl"
+    )
     return RunState(train=P(), robots=robots, ramp=P())
 
 

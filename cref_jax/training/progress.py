@@ -26,6 +26,9 @@ SHOWN = {  # name in the log: name on the screen and unit
     "walk/reward": ("reward", "per step"),
     "train/action_std": ("action deviation", ""),
     "loss/kl": ("KL", "nats"),
+    "loss/imitation": ("imitation error", "over all joints"),
+    "train/teacher_samples": ("samples of the teacher", ""),
+    "train/student_samples": ("samples of the student", ""),
     "train/learning_rate": ("learning rate", ""),
 }
 

@@ -30,6 +30,7 @@ class Memory(NamedTuple):
     carry: network.Carry
     features: network.Features | None  # of the current frame, [1, E, ...]; None for a blind policy
     twin: "Memory | None" = None  # of the mirrored policy, if symmetry is taught
+    teacher: network.Carry | None = None  # of the policy that this one learns from, if any
 
 
 @no_type_check
@@ -78,14 +79,18 @@ class Trace(NamedTuple):
     measures: environment.Measures
 
 
-def partition(axis: str, c: config.Network, has_twin: bool = False) -> Robots:
+def partition(
+    axis: str, c: config.Network, has_twin: bool = False, has_teacher: bool = False
+) -> Robots:
     """Return the partition spec of each array over the robots' `axis`; clocks are replicated."""
     robots = P(axis)
     memory = Memory(robots, P(None, axis) if c.sees else None)
     return Robots(
         env=robots,
         observation=robots,
-        memory=memory._replace(twin=memory if has_twin else None),
+        memory=memory._replace(
+            twin=memory if has_twin else None, teacher=robots if has_teacher else None
+        ),
         begins=robots,
         feed=CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P()) if c.sees else None,
     )
@@ -162,6 +167,12 @@ def with_twins(robots: Robots) -> Robots:
     return robots.replace(memory=robots.memory._replace(twin=blank))
 
 
+def with_teachers(robots: Robots) -> Robots:
+    """Add an empty memory of the teacher, which is like the student's."""
+    blank = jax.tree.map(jnp.zeros_like, robots.memory.carry)
+    return robots.replace(memory=robots.memory._replace(teacher=blank))
+
+
 def apply_policy(
     nets: Modules, train: ppo.TrainState, robots: Robots
 ) -> tuple[Memory, network.Output]:
@@ -201,7 +212,7 @@ def _apply_actor(
     carry, output = nets.actor.apply(
         params, memory.carry, obs[None], begins[None], view, method="decide"
     )
-    return Memory(carry, features), output
+    return Memory(carry, features, teacher=memory.teacher), output
 
 
 def env_step(
@@ -228,9 +239,14 @@ def step_policy(
 
 
 def collect(
-    world: World, nets: Modules, train: ppo.TrainState, robots: Robots, key: PRNGKeyArray
+    world: World,
+    nets: Modules,
+    train: ppo.TrainState,
+    robots: Robots,
+    key: PRNGKeyArray,
+    explores: bool = True,
 ) -> tuple[Robots, ppo.Rollout, Trace]:
-    """Collect a horizon of experience, with actions sampled from the policy.
+    """Collect a horizon of experience, with actions sampled from the policy, or its means.
 
     The features of the current frame come from older parameters, so it is encoded anew; after the
     horizon they are cleared, since the frame determines them.
@@ -244,7 +260,7 @@ def collect(
         robots = collection.robots
         memory, policy = apply_policy(nets, train, robots)
         mean = policy.mean[0]
-        action = mean + jnp.exp(policy.log_std) * noise
+        action = mean + jnp.exp(policy.log_std) * noise if explores else mean
         after, outcome = env_step(world, robots, memory, action)
         log_std = jnp.broadcast_to(policy.log_std, mean.shape)
         frame_valid = robots.feed and robots.feed.seen
@@ -342,4 +358,5 @@ def _to_rollout(
         carry=memory.carry,
         sight=sight,
         twin=memory.twin and memory.twin.carry,
+        guide=None if memory.teacher is None else steps.observation.heights,
     )

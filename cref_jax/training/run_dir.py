@@ -18,6 +18,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -38,14 +39,22 @@ def write_config(run: Path, c: Config) -> None:
     (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
 
 
-def write_origin(run: Path, iteration: int = 0, terrain: str = "", engine: str = "") -> None:
+def write_origin(
+    run: Path,
+    iteration: int = 0,
+    terrain: str = "",
+    engine: str = "",
+    samples: Mapping[str, int] | None = None,
+) -> None:
     """Append a line with the origin of this start: versions, device, command and git state.
 
-    `iteration` is the number of iterations done before it, `terrain` a name or a map's file.
+    `iteration` is the number of iterations done before it, `terrain` a name or a map's file,
+    `samples` those done by each stage of a run that has several.
     """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "iteration": iteration,
+        **({"samples": dict(samples)} if samples else {}),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
         **machine(),

@@ -69,6 +69,7 @@ def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
         ("no_grf", "network", "variant", "no_grf"),
         ("no_highway", "network", "variant", "no_highway"),
         ("blind", "network", "variant", "blind"),
+        ("hpl", "network", "variant", "hpl"),
         ("hpl_teacher", "network", "variant", "hpl_teacher"),
         ("full", "network", "variant", "full"),
         ("paper", "randomisation", "enabled", False),

@@ -75,6 +75,11 @@ def test_robots_that_do_not_split_get_the_nearest_numbers_that_do():
             {"network": {"variant": "hpl_teacher"}, "ppo": {"mirror_weight": 1.0}},
             "--ppo.mirror-weight must be 0 with --network.variant hpl_teacher",
         ),
+        (
+            {"network": {"variant": "hpl"}, "distillation": {"teacher_iterations": 20_000}},
+            "--distillation.teacher-iterations must be below --run.iterations, 20000, not 20000",
+        ),
+        ({"network": {"variant": "hpl", "convolutions": [[4, 48, 2]]}}, "leave no pixel"),
         ({"run": {"seed": 2**32}}, "--run.seed must be 0 to 4294967295"),
     ],
 )

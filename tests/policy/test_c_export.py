@@ -22,7 +22,8 @@ from tiny_policy import SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import deploy
 from cref_jax.deploy import Status
-from cref_jax.policy import sources
+from cref_jax.errors import ConfigError
+from cref_jax.policy import c_files, sources
 from cref_jax.runtime.status import STOPPING, WHY
 
 PERIOD = 0.02
@@ -74,12 +75,19 @@ def test_a_bundled_policy_says_in_c_what_it_said_in_training(name, programs, mon
     assert_equal(said, [(step[0], *x) for step, x in zip(steps, of_training, strict=True)])
 
 
-@pytest.mark.parametrize("variant", deploy.VARIANTS)
+@pytest.mark.parametrize("variant", c_files.VARIANTS)
 def test_every_variant_of_the_network_says_in_c_what_it_says_in_numpy(
     variant, programs, monkeypatch
 ):
     leave_out_cross_checks(monkeypatch)
     assert_says_the_same(tiny(variant), programs(variant))
+
+
+def test_a_network_that_c_does_not_have_is_refused_in_one_line():
+    with pytest.raises(
+        ConfigError, match=r"C has the networks full, .*, blind, not hpl; use numpy"
+    ):
+        c_files.write_c(*tiny("hpl"))
 
 
 def test_filters_that_overlap_are_padded_as_in_numpy(programs, monkeypatch):

@@ -34,7 +34,7 @@ def policy(
     """
     c = robot.fill_in(Config(), name)
     c = dataclasses.replace(c, network=dataclasses.replace(net, variant=variant))
-    actor, carry = network.Actor(c.network, J), network.initial_carry(c.network, 1)
+    actor, carry = network.build_actor(c.network, J), network.initial_carry(c.network, 1)
     sight = None
     if variant != "blind":
         zero = jnp.zeros((1, 1), jnp.int32)
