@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 from cref_jax import cli
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World, build_physics, build_world
-from cref_jax.errors import CheckpointError, ConfigError, DamagedCheckpoint
+from cref_jax.errors import ConfigError
 from cref_jax.evaluation import walking
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
@@ -300,22 +300,7 @@ def _first_state(
         return state.replace(train=processes.replicate(learned, mesh))
     if not options.resume:
         return state
-    stored, here = steps.meta(), trainer.describe_sharding(state, mesh)
-    there = {name: stored.get(name, 1) for name in here}
-    if there == here:
-        try:
-            return steps.restore(state)[0]
-        except DamagedCheckpoint:
-            raise
-        except CheckpointError as error:  # the environment has gained or lost a part of its state
-            if ": robots/" not in str(error):
-                raise
-            print(f"the robots' state is of another version: {error}")
-    for name, count in here.items():
-        if there[name] != count:
-            print(f"{name} changes from {there[name]} to {count}")
-    print("so what was learned is kept, the robots start anew, and the run is no longer the same")
-    return steps.restore(state, parts=("train",))[0]
+    return resumption.restore(steps, state, trainer.describe_sharding(state, mesh))
 
 
 def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""What a resumed run may change, and what would make it another run."""
+"""What a resumed run may change, what would make it another run, and where it goes on."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from cref_jax.config import Config, presets
-from cref_jax.errors import ConfigError
+from cref_jax.errors import CheckpointError, ConfigError, DamagedCheckpoint
 from cref_jax.training import run_dir
+from cref_jax.training.checkpoint import Checkpoints
+from cref_jax.training.iteration import RunState
 
 MAY_CHANGE = (
     "run.iterations",
@@ -16,6 +18,33 @@ MAY_CHANGE = (
     "run.keep",
     "run.num_envs",  # what was learned goes on, with fresh robots
 )
+
+
+def restore(steps: Checkpoints, state: RunState, here: dict[str, int]) -> RunState:
+    """Restore the newest checkpoint into a state like `state`, sharded as `here` says.
+
+    Of one that was sharded otherwise, or whose robots are of another version of the program, what
+    was learned alone is taken, and that is said.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    stored = steps.meta()
+    there = {name: stored.get(name, 1) for name in here}
+    if there == here:
+        try:
+            return steps.restore(state)[0]
+        except DamagedCheckpoint:
+            raise
+        except CheckpointError as error:  # the environment has gained or lost a part of its state
+            if ": robots/" not in str(error):
+                raise
+            print(f"the robots' state is of another version: {error}")
+    for name, count in here.items():
+        if there[name] != count:
+            print(f"{name} changes from {there[name]} to {count}")
+    print("so what was learned is kept, the robots start anew, and the run is no longer the same")
+    return steps.restore(state, parts=("train",))[0]
 
 
 def check_origin(
