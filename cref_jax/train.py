@@ -27,6 +27,7 @@ from cref_jax.policy import learner_file, sources, trained, warm_start
 from cref_jax.rendering import map_plot
 from cref_jax.robot import ROBOTS, fill_in
 from cref_jax.system import jax_setup, parallel
+from cref_jax.system.interrupts import StopRequest
 from cref_jax.terrain import map_files
 from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import (
@@ -232,8 +233,9 @@ def _run_stages(
     last = taught.config.run.iterations
     if (steps.latest() or 0) > last:
         return _run_stage(world, mesh, steps, report, options)
-    state = _run_stage(taught, mesh, steps, report, options)
-    if int(state.train.iteration) < last:
+    stop = StopRequest()
+    state = _run_stage(taught, mesh, steps, report, options, stop)
+    if stop.requested or int(state.train.iteration) < last:
         return state
     report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")
     programs = Programs(world, mesh, report)
@@ -247,6 +249,7 @@ def _run_stage(
     steps: Checkpoints,
     report: Reporter | SilentReporter,
     options: Options,
+    stop: StopRequest | None = None,
 ) -> iteration.RunState:
     """Train from the first state, or from the newest checkpoint, to the last iteration."""
     c, first = world.config, steps.latest() or 0
@@ -254,7 +257,7 @@ def _run_stage(
     if first < c.run.iterations:
         programs.get(min(c.run.chunk, c.run.iterations - first))
     state = _first_state(world, mesh, steps, options)
-    return trainer.run_chunks(world, state, steps, report, programs)
+    return trainer.run_chunks(world, state, steps, report, programs, stop)
 
 
 def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Reporter | SilentReporter:

@@ -22,6 +22,7 @@ SETTINGS = {
     "curriculum": "Curriculum", "command": "Command", "episode": "Episode",
     "randomisation": "Randomisation", "reward": "Reward", "scan": "Scan", "camera": "Camera",
     "foothold": "Foothold", "network": "Network", "ppo": "PPO",
+    "distillation": "Distillation",
 }  # fmt: skip
 POLICIES = ("mixed", "robust")
 

@@ -1,5 +1,6 @@
 """The command line of training: what it refuses, what it writes, and that it resumes exactly."""
 
+import contextlib
 import json
 import shutil
 import signal
@@ -149,15 +150,18 @@ def test_a_run_of_two_stages_goes_on_from_either_bit_for_bit_and_walks_in_numpy(
     assert "the teacher is done after 0.0 M samples" in said
     assert "trained for 0.0 M samples (0.0 M by the teacher, 0.0 M by the student)" in said
     whole = Reporter.chunk
-    for stopped in (1, 3):
+    for stopped in (1, 2, 3):  # in the first stage, by Ctrl-C at its end, and in the second
 
         def chunk(report, done, log, seconds, last=stopped):
             whole(report, done, log, seconds)
-            if done + 1 == last:
+            if done + 1 == last == 2:
+                signal.raise_signal(signal.SIGINT)
+            elif done + 1 == last:
                 raise OSError(28, "No space left on device")
 
         folder = tmp_path / f"stopped-{stopped}"
-        with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        ends = contextlib.nullcontext() if stopped == 2 else pytest.raises(SystemExit)
+        with monkeypatch.context() as patch, ends:
             patch.setattr(Reporter, "chunk", chunk)
             run(folder, *TWO_STAGES)
         assert Checkpoints(folder / "checkpoints").latest() == stopped

@@ -61,8 +61,12 @@ def run_chunks(
     steps: Checkpoints,
     report: Reporter | SilentReporter,
     programs: Programs,
+    stop: interrupts.StopRequest | None = None,
 ) -> iteration.RunState:
-    """Train chunk by chunk; save in between, at the end, when asked to stop, and on an error."""
+    """Train chunk by chunk; save in between, at the end, when asked to stop, and on an error.
+
+    `stop` says afterwards whether a process was asked to.
+    """
     c = world.config
     done = int(state.train.iteration)
     if done >= c.run.iterations:
@@ -70,7 +74,7 @@ def run_chunks(
         return state
     saved = time.monotonic()
     stops = False
-    with interrupts.StopRequest() as stop:
+    with stop or interrupts.StopRequest() as stop:
         try:
             while done < c.run.iterations and not stops:
                 program = programs.get(min(c.run.chunk, c.run.iterations - done))
@@ -84,6 +88,7 @@ def run_chunks(
                 done = int(state.train.iteration)
                 is_due = time.monotonic() - saved > 60 * c.run.checkpoint_minutes
                 stops, is_due = processes.any_says(stop.requested, is_due)
+                stop.requested = stops
                 if is_due:
                     _save(steps, state, done, programs.mesh)
                     saved = time.monotonic()
