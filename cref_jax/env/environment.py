@@ -248,8 +248,7 @@ def _reward_snapshot(
     c, feet = world.config, world.physics.feet
     period = c.physics.control_period
     foot = links.position[feet]
-    touching = rewards.is_touching(force, c.reward)
-    single = touching[0] ^ touching[1]
+    single = state.gait.down[0] ^ state.gait.down[1]
     now = observations.motion(body.qpos, body.qvel, action.size)
     across = geometry.rotate_yaw(-geometry.yaw(body.qpos[3:7]), foot[0] - foot[1])[1]
     return rewards.Snapshot(

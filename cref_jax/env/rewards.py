@@ -40,7 +40,7 @@ class Snapshot(NamedTuple):
     last_air_time: Float[Array, " F"]  # s, of each foot's last swing, this one included
     foothold_distance: Float[Array, " F"]  # m, d_xz to the nearest candidate; inf: there is none
     unsupported: Int[Array, " F"]  # samples of the sole that are over nothing
-    since_single: Float[Array, ""]  # s since exactly one foot touched
+    since_single: Float[Array, ""]  # s since exactly one foot was down, a lift of one step left out
     control_period: Float[Array, ""]  # s
 
 
@@ -95,7 +95,7 @@ def orientation(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]
 
 
 def feet_contact(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
-    """I_stand + (1 - I_stand) I_single: one foot alone has touched within the last 0.2 s."""
+    """I_stand + (1 - I_stand) I_single: one foot alone was down within the last 0.2 s."""
     single = s.since_single <= c.single_contact_window + 1e-6
     return jnp.where(is_standing(s.command, c), 1.0, single.astype(jnp.float32))
 

@@ -55,7 +55,7 @@ class EnvState:
     action_before: Float[Array, " J"]  # a_{t-2}
     foot_velocity: Float[Array, "F 3"]  # m/s, world
     gait: Gait
-    since_single: Float[Array, ""]  # s since one foot alone touched
+    since_single: Float[Array, ""]  # s since one foot alone was down, as of `gait`
     support_z: Float[Array, ""]  # m, height of the last support
     candidates: Candidates  # where each foot may step, as seen when it last bore on the ground
     foothold_distance: Float[Array, " F"]  # m, of each sole from the nearest of them, up to a limit
