@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from cref_jax import config
 from cref_jax.network.frame_slots import repeat_frames
-from cref_jax.network.layers import HEAD_SCALE, MLP
+from cref_jax.network.layers import HEAD_SCALE, MLP, floor_log_std
 from cref_jax.network.modules import (
     CrossAttention,
     DepthCompression,
@@ -111,7 +111,7 @@ class Actor(nn.Module):
             x = jnp.concatenate([x, jnp.where(valid, context, 0.0)], axis=-1)
         f = self.fusion(x)
         gru, y, gate = self.recurrent_fusion(carry.gru, f, begins)
-        log_std = jnp.maximum(self.log_std, math.log(max(self.c.min_std, 1e-9)))
+        log_std = floor_log_std(self.log_std, self.c.min_std)
         output = Output(self.action_head(y), log_std, velocity, y, gate, attention)
         return Carry(*lstm, gru), output
 

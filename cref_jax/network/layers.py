@@ -4,6 +4,7 @@ All arrays have the axes [T, E, ...]. Only the recurrent cells iterate over time
 processes T * E samples at once.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +23,11 @@ _EPSILON = 1e-6  # added to the variance of a layer norm; assumed: Flax's defaul
 def dense(features: int, name: str, **settings: Any) -> nn.Dense:
     """Create a dense layer with the faster gradient of `product`."""
     return nn.Dense(features, dot_general=_dot_general, name=name, **settings)
+
+
+def floor_log_std(log_std: Float[Array, " J"], least: float) -> Float[Array, " J"]:
+    """Raise the logarithm of each action's deviation to that of the least one, which may be 0."""
+    return jnp.maximum(log_std, math.log(max(least, 1e-9)))
 
 
 @jax.custom_vjp

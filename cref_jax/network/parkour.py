@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from cref_jax import config
 from cref_jax.network import patches, records
 from cref_jax.network.frame_slots import repeat_frames
-from cref_jax.network.layers import GRU, HEAD_SCALE, MLP, dense, elu
+from cref_jax.network.layers import GRU, HEAD_SCALE, MLP, dense, elu, floor_log_std
 from cref_jax.network.records import Carry, DepthInput, EncodedInput, Features, Output
 
 _HEIGHT_MLP = (128, 64)  # hidden widths; the latent after them is as wide as C_psi(D), 32
@@ -118,7 +118,7 @@ class ParkourActor(nn.Module):
         else:
             latent = self.height_encoder(_HEIGHT_SCALE * view)
         gru, h = self.gru(carry.gru, jnp.concatenate([obs, latent], axis=-1), begins)
-        log_std = jnp.maximum(self.log_std, math.log(max(self.c.min_std, 1e-9)))
+        log_std = floor_log_std(self.log_std, self.c.min_std)
         velocity = jnp.zeros((*h.shape[:2], 3))
         output = Output(self.action_head(h), log_std, velocity, h, jnp.ones_like(h), None)
         return carry._replace(gru=gru), output
