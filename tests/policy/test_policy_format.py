@@ -19,9 +19,15 @@ MUTATIONS = 10_000
 
 
 @pytest.fixture(scope="module")
-def files() -> dict[str, bytes]:
-    """Return the files of a small policy that is whole."""
-    manifest, arrays = contents(policy("full"))
+def original() -> tuple[dict, dict]:
+    """Return the manifest, with the second it was written in, and the weights of a small policy."""
+    return contents(policy("full"))
+
+
+@pytest.fixture(scope="module")
+def files(original) -> dict[str, bytes]:
+    """Return the files of that policy, whole."""
+    manifest, arrays = original
     return signed(manifest, {"weights.npz": writer._to_npz(arrays)})
 
 
@@ -58,8 +64,9 @@ def npz(arrays, **settings) -> bytes:
     return data.getvalue()
 
 
-def test_what_was_written_is_read_from_the_directory_and_from_the_archive(tmp_path, files):
-    original = contents(policy("full"))
+def test_what_was_written_is_read_from_the_directory_and_from_the_archive(
+    tmp_path, files, original
+):
     put(tmp_path, files)
     (tmp_path / "policy.zip").write_bytes(writer._zip_stored(files))
     for path in (tmp_path, tmp_path / "policy.zip"):
