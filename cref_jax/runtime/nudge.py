@@ -12,7 +12,7 @@ from cref_jax.runtime.joints import Joints
 from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.status import Status
 
-PITCH = 0.083  # of the hips' torque, as long as they do not move; an X2's targets turn by 0.1 rad
+PITCH = 0.083  # of the hips' torque, as long as they do not move; 0.1 rad of 1.2, torque over kp
 ROLL = 0.125  # of one hip's torque; 0.15 rad, of which a standing robot reaches a tenth
 SWING = 0.16  # s, to and fro
 AFTER = 2  # control periods, in which the last of it is answered

@@ -20,7 +20,7 @@ MOST_JOINT_SPEED = 50.0  # rad/s; walking with noise stays below 25
 POSE_MARGIN = 0.5  # rad beyond a joint's range; more means degrees, or another joint's angle
 MOST_FOOT_TILT = 0.35  # at the start, 20 deg; sensors of a randomised robot show up to 6 deg
 MOST_CHANGE = 0.08  # of it before the start, 5 deg
-MOST_SAG = 0.23  # rad, of joints that are held; in 0.2 s a simulated X2's yield by 0.21
+MOST_SAG = 0.23  # rad, of joints that are held; in simulation they yield by 0.21 in 0.2 s
 MOST_APART = 0.08  # of the soles of two feet that stand
 TILTS = 5  # samples, of which a mean has little noise
 
