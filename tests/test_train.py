@@ -13,6 +13,7 @@ from types import ModuleType
 import jax
 import numpy as np
 import pytest
+from small_world import assert_equal
 
 from cref_jax import config, export, train
 from cref_jax.env.world import build_world
@@ -149,9 +150,9 @@ def test_a_run_of_two_stages_goes_on_from_either_bit_for_bit_and_walks_in_numpy(
     said = capsys.readouterr().out
     assert "the teacher is done after 0.0 M samples" in said
     assert "trained for 0.0 M samples (0.0 M by the teacher, 0.0 M by the student)" in said
-    whole = Reporter.chunk
+    whole, folder = Reporter.chunk, tmp_path / "stopped"
     for stopped in (1, 2, 3):  # in the first stage, by Ctrl-C at its end, and in the second
-        jax.clear_caches()  # seven runs in one process have too many mappings, see conftest.py
+        jax.clear_caches()  # five runs in one process have too many mappings, see conftest.py
 
         def chunk(report, done, log, seconds, last=stopped):
             whole(report, done, log, seconds)
@@ -160,22 +161,23 @@ def test_a_run_of_two_stages_goes_on_from_either_bit_for_bit_and_walks_in_numpy(
             elif done + 1 == last:
                 raise OSError(28, "No space left on device")
 
-        folder = tmp_path / f"stopped-{stopped}"
         ends = contextlib.nullcontext() if stopped == 2 else pytest.raises(SystemExit)
         with monkeypatch.context() as patch, ends:
             patch.setattr(Reporter, "chunk", chunk)
-            run(folder, *TWO_STAGES)
+            run(folder, *(["--resume"] if stopped > 1 else TWO_STAGES))
         assert Checkpoints(folder / "checkpoints").latest() == stopped
         if stopped == 1:
             with pytest.raises(ConfigError, match="no student yet, its teacher 1 of 2 iterations"):
                 trained.load_policy(folder, build_world(run_dir.read_config(folder)))
-        run(folder, "--resume")
-        straight, halves = state_of(tmp_path / "straight"), state_of(folder)
-        assert all(np.array_equal(a, b) for a, b in zip(straight, halves, strict=True))
+    run(folder, "--resume")
+    straight, parts = state_of(tmp_path / "straight"), state_of(folder)
+    assert all(np.array_equal(a, b) for a, b in zip(straight, parts, strict=True))
     starts = [json.loads(line) for line in (folder / "origin.jsonl").open()]
     # of 8 robots in 24 steps
     assert [start["samples"] for start in starts] == [
         {"teacher": 0, "student": 0},
+        {"teacher": 192, "student": 0},
+        {"teacher": 2 * 192, "student": 0},
         {"teacher": 2 * 192, "student": 192},
     ]
     export.main(["--run", str(folder), "--out", str(tmp_path / "policy")])
@@ -386,17 +388,23 @@ def test_devices_share_the_robots_and_hold_the_same_parameters(
     state = jax.jit(iteration.initial_state, static_argnames="mesh")(world, mesh)
     assert [s.data.shape[0] for s in state.robots.begins.addressable_shards] == [4, 4]
     first, second = (s.data for s in state.robots.env.body.qpos.addressable_shards)
-    assert not np.array_equal(first, second), "each device has its own random numbers"
+    assert not np.array_equal(first, second), "each robot has its own random numbers"
+    single = iteration.make_mesh(1)
+    alone = jax.jit(iteration.initial_state, static_argnames="mesh")(world, single)
+    assert_equal(alone, state)
+    _, alone_log = iteration.chunk(world, alone, single, 1)
     state, log = iteration.chunk(world, state, mesh, 2)
     for leaf in jax.tree.leaves(state.train):
         shards = [np.asarray(s.data) for s in leaf.addressable_shards]
         np.testing.assert_array_equal(*shards)
+    # the first horizon comes before any update, whose minibatches are each device's
+    np.testing.assert_allclose(log["walk/reward"][0], alone_log["walk/reward"][0], rtol=1e-5)
     lines = [json.loads(line) for line in (tmp_path / "two" / "log.jsonl").open()]
     # the same run on the command line, of which the log has six digits
     np.testing.assert_allclose(log["walk/reward"], [x["walk/reward"] for x in lines], rtol=1e-5)
     capsys.readouterr()
     run(tmp_path / "two", "--devices", "1", "--iterations", "3", "--resume")
-    assert "shares changes from 2 to 1" in capsys.readouterr().out
+    assert "shares changes from 2 to 1; the robots go on" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("asked", ["3", "0"])

@@ -70,7 +70,7 @@ def _run_episodes(
     world: World, train: ppo.TrainState, key: PRNGKeyArray, episodes: int, steps: int
 ) -> tuple[Ending, _EpisodeStep]:
     """Simulate the episodes; return each robot's first end and its steps [T, E] until then."""
-    robots = rollout.start(world, key, episodes)
+    robots = rollout.start(world, jax.random.split(key, episodes))
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
 
     def step(

@@ -94,7 +94,7 @@ def record_sensors(world: World, train: ppo.TrainState, steps: int, key: Array) 
             fresh=jnp.zeros((), bool) if feed is None else feed.fresh & feed.seen[0],
         )
 
-    robots = rollout.start(world, key, 1)
+    robots = rollout.start(world, jax.random.split(key, 1))
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
     walk = jax.jit(lambda robots: jax.lax.scan(step, robots, None, length=steps)[1])
     return jax.tree.map(np.asarray, walk(robots))

@@ -93,7 +93,7 @@ def learn(
     nets: rollout.Modules,
     train: ppo.TrainState,
     robots: rollout.Robots,
-    key: PRNGKeyArray,
+    keys: rollout.Keys,
     axis: str | None = None,
 ) -> tuple[ppo.TrainState, rollout.Robots, Losses, rollout.Trace]:
     """Let the student act for a horizon, and teach it what its teacher would have done.
@@ -101,13 +101,12 @@ def learn(
     It acts by its mean (assumed: as it is evaluated).
     """
     c, taught = world.config, robots.memory.teacher
-    key_act, key_update = jax.random.split(key)
-    robots, seen, trace = rollout.collect(world, nets, train, robots, key_act, explores=False)
+    robots, seen, trace = rollout.collect(world, nets, train, robots, keys.robots, explores=False)
     obs = ppo.normalize(train.statistics.obs, ppo.zero_invalid(seen).obs)
     teacher = network.build_actor(teacher_config(c).network, seen.action.shape[-1])
     taught, output = teacher.apply(train.teacher, taught, obs, seen.begins, seen.guide)
     lesson = Lesson(obs, seen.begins, seen.valid, seen.sight, output.mean, seen.carry)
-    train, losses = update(train, lesson, key_update, c, nets.functions.actor, axis)
+    train, losses = update(train, lesson, keys.update, c, nets.functions.actor, axis)
     robots = robots.replace(memory=robots.memory._replace(teacher=taught))
     return train, robots, losses, trace
 

@@ -50,7 +50,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     key_robots, key_params = jax.random.split(jax.random.key(c.run.seed))
 
     def start(world: World, key: Array) -> rollout.Robots:
-        robots = rollout.start(world, _device_key(key), c.run.num_envs // mesh.size)
+        robots = rollout.start(world, _robot_keys(key, c.run.num_envs // mesh.size))
         robots = rollout.with_teachers(robots) if c.network.variant == "hpl" else robots
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
@@ -137,9 +137,12 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     ) -> tuple[RunState, Losses | distillation.Losses, rollout.Trace]:
         robots = rollout.with_randomization(state.robots, state.ramp.share)
         teach = distillation.learn if c.network.variant == "hpl" else _reinforce
-        train, robots, losses, trace = teach(
-            world, nets, state.train, robots, _device_key(key), AXIS
+        key_robots, key_update = jax.random.split(key)
+        keys = rollout.Keys(
+            robots=_robot_keys(key_robots, robots.begins.size),
+            update=jax.random.fold_in(key_update, jax.lax.axis_index(AXIS)),
         )
+        train, robots, losses, trace = teach(world, nets, state.train, robots, keys, AXIS)
         return state.replace(train=train, robots=robots), losses, trace
 
     parts = partition(world)
@@ -174,14 +177,13 @@ def _reinforce(
     nets: rollout.Modules,
     train: ppo.TrainState,
     robots: rollout.Robots,
-    key: Array,
+    keys: rollout.Keys,
     axis: str,
 ) -> tuple[ppo.TrainState, rollout.Robots, Losses, rollout.Trace]:
     """Collect a horizon of experience and learn from it by PPO."""
-    key_act, key_update = jax.random.split(key)
-    robots, experience, trace = rollout.collect(world, nets, train, robots, key_act)
+    robots, experience, trace = rollout.collect(world, nets, train, robots, keys.robots)
     c = world.config.ppo
-    train, losses = ppo.update(train, experience, key_update, c, nets.functions, axis)
+    train, losses = ppo.update(train, experience, keys.update, c, nets.functions, axis)
     return train, robots, losses, trace
 
 
@@ -205,9 +207,10 @@ def partition(world: World) -> RunState:
     return RunState(train=P(), robots=robots, ramp=P())
 
 
-def _device_key(key: Array) -> Array:
-    """Derive this device's own key."""
-    return jax.random.fold_in(key, jax.lax.axis_index(AXIS))
+def _robot_keys(key: Array, count: int) -> Array:
+    """Derive a key for each of this device's robots from its index among those of all devices."""
+    index = jax.lax.axis_index(AXIS) * count + jnp.arange(count)
+    return jax.vmap(functools.partial(jax.random.fold_in, key))(index)
 
 
 def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) -> Log:

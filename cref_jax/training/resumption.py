@@ -5,6 +5,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
 from cref_jax.config import Config, presets
 from cref_jax.errors import CheckpointError, ConfigError, DamagedCheckpoint
 from cref_jax.training import run_dir
@@ -23,28 +27,44 @@ MAY_CHANGE = (
 def restore(steps: Checkpoints, state: RunState, here: dict[str, int]) -> RunState:
     """Restore the newest checkpoint into a state like `state`, sharded as `here` says.
 
-    Of one that was sharded otherwise, or whose robots are of another version of the program, what
-    was learned alone is taken, and that is said.
+    Of one with another number of robots, whose robots walk on other kinds of lanes than those of
+    `state`, or are of another version of the program, what was learned alone is taken, and that is
+    said.
 
     Raises:
         CheckpointError: it cannot be read.
     """
     stored = steps.meta()
     there = {name: stored.get(name, 1) for name in here}
-    if there == here:
+    changes = "; ".join(
+        f"{name} changes from {there[name]} to {count}"
+        for name, count in here.items()
+        if there[name] != count
+    )
+    if there["num_envs"] == here["num_envs"]:
         try:
-            return steps.restore(state)[0]
+            stored_state = steps.restore(state)[0]
+            if _have_equal_lanes(state, stored_state):
+                if changes:
+                    print(f"{changes}; the robots go on, with other minibatches")
+                return stored_state
+            print("robots are assigned to other kinds of lanes")
         except DamagedCheckpoint:
             raise
         except CheckpointError as error:  # the environment has gained or lost a part of its state
             if ": robots/" not in str(error):
                 raise
             print(f"the robots' state is of another version: {error}")
-    for name, count in here.items():
-        if there[name] != count:
-            print(f"{name} changes from {there[name]} to {count}")
+    if changes:
+        print(changes)
     print("so what was learned is kept, the robots start anew, and the run is no longer the same")
     return steps.restore(state, parts=("train",))[0]
+
+
+@jax.jit
+def _have_equal_lanes(state: RunState, other: RunState) -> Bool[Array, ""]:
+    """Check that each robot has the same kind of lane: a program is compiled for them."""
+    return jnp.all(state.robots.env.kind == other.robots.env.kind)
 
 
 def check_origin(

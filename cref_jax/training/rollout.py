@@ -71,6 +71,13 @@ class _Step(NamedTuple):
     frame_valid: Bool[Array, " E"] | None  # None for a blind policy
 
 
+class Keys(NamedTuple):
+    """The random numbers of one iteration on one device."""
+
+    robots: Key[Array, " E"]  # the same for a robot on whichever device it is
+    update: PRNGKeyArray  # this device's
+
+
 class Trace(NamedTuple):
     """Per-step results that the update does not need."""
 
@@ -124,18 +131,16 @@ def initial_params(
     )
 
 
-def start(world: World, key: PRNGKeyArray, num_envs: int) -> Robots:
-    """Place E robots on lanes: kinds in turn, random low levels, episodes at random times."""
+def start(world: World, keys: Key[Array, " E"]) -> Robots:
+    """Place robots on lanes: kinds in turn, random low levels, episodes at random times."""
     c = world.config
-    key_level, key_reset, key_see, key_step = jax.random.split(key, 4)
-    kinds = jnp.asarray(world.lanes.kind_of(np.arange(num_envs)))
-    highest = min(c.curriculum.start_level, world.lanes.levels - 1)
-    levels = jax.random.randint(key_level, (num_envs,), 0, highest + 1)
-    split = lambda k: jax.random.split(k, num_envs)
-    state = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0))(world, split(key_reset), kinds, levels)
-    longest = round(c.episode.length / c.physics.control_period)
-    state = state.replace(step=jax.random.randint(key_step, (num_envs,), 0, longest))
-    return init_robots(world, state, split(key_see))
+    each = jax.vmap(lambda key: jax.random.split(key, 4))(keys)
+    draw = lambda of, end: jax.vmap(lambda key: jax.random.randint(key, (), 0, end))(each[:, of])
+    kinds = jnp.asarray(world.lanes.kind_of(np.arange(keys.shape[0])))
+    levels = draw(0, min(c.curriculum.start_level, world.lanes.levels - 1) + 1)
+    state = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0))(world, each[:, 1], kinds, levels)
+    state = state.replace(step=draw(2, round(c.episode.length / c.physics.control_period)))
+    return init_robots(world, state, each[:, 3])
 
 
 def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots:
@@ -243,7 +248,7 @@ def collect(
     nets: Modules,
     train: ppo.TrainState,
     robots: Robots,
-    key: PRNGKeyArray,
+    keys: Key[Array, " E"],
     explores: bool = True,
 ) -> tuple[Robots, ppo.Rollout, Trace]:
     """Collect a horizon of experience, with actions sampled from the policy, or its means.
@@ -276,9 +281,9 @@ def collect(
         )
         return _store_frame(collection.replace(robots=after)), done
 
-    keys = jax.random.split(key, c.ppo.horizon)
-    draw = lambda key: jax.random.normal(key, robots.env.action.shape)
-    collection, steps = jax.lax.scan(step, _start_buffer(c, robots), jax.vmap(draw)(keys))
+    shape = c.ppo.horizon, robots.env.action.shape[-1]
+    noise = jax.vmap(lambda key: jax.random.normal(key, shape), out_axes=1)(keys)
+    collection, steps = jax.lax.scan(step, _start_buffer(c, robots), noise)
     after = collection.robots
     after = after.replace(memory=_clear_features(after.memory))
     rollout = _to_rollout(c, nets, train, first.memory, collection.frames, steps)

@@ -180,7 +180,7 @@ def test_a_lesson_is_what_the_teacher_would_do_where_the_students_mean_action_le
     nets = rollout.networks(world.config.network, world.physics.robot.num_joints)
     collect = functools.partial(rollout.collect, explores=False)
     _, seen, _ = jax.jit(collect, static_argnums=1)(
-        world, nets, begun.train, begun.robots, jax.random.key(2)
+        world, nets, begun.train, begun.robots, jax.random.split(jax.random.key(2), 4)
     )
     np.testing.assert_array_equal(seen.action, seen.mean)
     teacher = rollout.networks(

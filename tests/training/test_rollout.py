@@ -45,8 +45,9 @@ def two_horizons(variant: str):
     state = jax.jit(iteration.initial_state)(world)
     nets = rollout.networks(c.network, world.physics.robot.num_joints)
     collect = jax.jit(lambda w, r, k: rollout.collect(w, nets, state.train, r, k))
-    middle, first, _ = collect(world, state.robots, jax.random.key(1))
-    last, second, _ = collect(world, middle, jax.random.key(2))
+    first_keys, second_keys = jax.random.split(jax.random.key(1), (2, E))
+    middle, first, _ = collect(world, state.robots, first_keys)
+    last, second, _ = collect(world, middle, second_keys)
     return world, nets, state.train, (state.robots, middle, last), (first, second)
 
 
