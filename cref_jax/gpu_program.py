@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cref_jax import cli, depth, robot
-from cref_jax.benchmarks import hlo
+from cref_jax.benchmarks import hlo, source_stages
 from cref_jax.config import Config, limits, presets
 from cref_jax.config.ranges import Within
 from cref_jax.env.world import World
@@ -41,20 +41,6 @@ LAUNCH = 3e-6  # s; assumed: least time per kernel, including its launch
 BANDWIDTH_SHARE = 0.8  # assumed: achieved share of the card's bandwidth
 PRODUCT_SHARE = 0.25  # assumed: achieved share of the card's TF32 rate
 MARCH_TURNS = 80  # assumed: blocks crossed by the longest ray of a frame
-
-STAGES = (  # stage, file and, unless empty, function in the stack; the first match counts
-    ("physics: MJX, line search", "mjx/_src/solver.py", "_linesearch"),
-    ("physics: MJX, Newton", "mjx/_src/solver.py", ""),
-    ("physics: MJX, before the solver", "cref_jax/physics/mjx_engine.py", ""),
-    ("physics: tangent planes", "cref_jax/physics/simulation.py", "planes"),
-    ("physics: rest", "cref_jax/physics/simulation.py", "step"),
-    ("update", "cref_jax/ppo/learner.py", "update"),
-    ("policy", "cref_jax/training/rollout.py", "apply_policy"),
-    ("depth", "cref_jax/training/camera_feed.py", "render_frames"),
-    ("environment: rest", "cref_jax/env/", ""),
-    ("rollout: rest", "cref_jax/training/rollout.py", ""),
-)
-REST = "rest"
 
 
 class Card(NamedTuple):
@@ -213,20 +199,22 @@ def estimate_stages(program: hlo.Program, c: Config, card: Card) -> dict[str, St
     frames = depth.max_frames(c.ppo.horizon, c.camera, c.physics.control_period)
 
     def trip_count(stack: tuple[hlo.Frame, ...]) -> float:
-        if _is_at(stack, "mjx/_src/solver.py", ""):
+        if source_stages.is_at(stack, "mjx/_src/solver.py", ""):
             return float(c.physics.iterations)  # the slowest robot needs the maximum
-        if _is_at(stack, "cref_jax/depth/raymarch.py", ""):
+        if source_stages.is_at(stack, "cref_jax/depth/raymarch.py", ""):
             return float(MARCH_TURNS)
         return (
             frames / c.ppo.horizon
-            if _is_at(stack, "cref_jax/training/camera_feed.py", "update_feed")
+            if source_stages.is_at(stack, "cref_jax/training/camera_feed.py", "update_feed")
             else 1.0
         )
 
     stages = collections.defaultdict(lambda: Stage(0.0, 0.0, 0.0, 0.0))
     for kernel in program.kernels(trip_count):
-        name = stage_of(kernel.stack)
-        name = stage_of(kernel.loop) if name == REST else name  # a copy of the loop carry
+        name = source_stages.stage_of(kernel.stack)
+        name = (
+            source_stages.stage_of(kernel.loop) if name == source_stages.REST else name
+        )  # a copy of the loop carry
         moved = kernel.bytes / (BANDWIDTH_SHARE * card.bandwidth)
         seconds = max(LAUNCH, moved, kernel.flops / (PRODUCT_SHARE * card.products))
         one = Stage(1.0, kernel.bytes, kernel.flops, seconds)
@@ -234,17 +222,6 @@ def estimate_stages(program: hlo.Program, c: Config, card: Card) -> dict[str, St
             *(a + kernel.times * b for a, b in zip(stages[name], one, strict=True))
         )
     return dict(sorted(stages.items(), key=lambda item: -item[1].seconds))
-
-
-def stage_of(stack: tuple[hlo.Frame, ...]) -> str:
-    """Return the stage of a source stack by its files and functions; `REST` without a match."""
-    return next((name for name, *place in STAGES if _is_at(stack, *place)), REST)
-
-
-def _is_at(stack: tuple[hlo.Frame, ...], file: str, function: str) -> bool:
-    return any(
-        file in frame.file and function in ("", *frame.function.split(".")) for frame in stack
-    )
 
 
 def show(c: Config, card: Card, compiled: jax.stages.Compiled, stages: dict[str, Stage]) -> None:

@@ -17,6 +17,7 @@ import tyro
 from jax.sharding import Mesh
 
 from cref_jax import cli
+from cref_jax.benchmarks import profiled
 from cref_jax.config import Config, limits, presets
 from cref_jax.env.world import World, build_physics, build_world
 from cref_jax.errors import ConfigError
@@ -43,7 +44,6 @@ from cref_jax.training import (
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
-from cref_jax.training.trainer import Programs
 
 PROGRAM = "python -m cref_jax.train"
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
@@ -98,6 +98,8 @@ class Options(cli.DebugOption):
     """evaluate 100 episodes on flat ground at the end"""
     tensorboard: bool = True
     """write TensorBoard files"""
+    profile: bool = False
+    """trace one call of the program: stages.json in the run's folder holds its time by stage"""
     wandb: bool = False
     """log to Weights & Biases as well (pip install 'cref-jax[wandb]'): offline without a login"""
 
@@ -203,6 +205,7 @@ def train(options: Options, c: Config) -> None:
     world = processes.replicate(build_world(c, options.engine, threads), mesh)
     name = run_dir.reserve if processes.is_first() else run_dir.ROOT.joinpath
     run = options.run_dir or name(_name(options))
+    options = dataclasses.replace(options, run_dir=run)
     with lock(run) if processes.is_first() else contextlib.nullcontext():
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
@@ -238,7 +241,8 @@ def _run_stages(
     if stop.requested or int(state.train.iteration) < last:
         return state
     report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")
-    programs = Programs(world, mesh, report)
+    folder = options.run_dir if options.profile else None
+    programs = profiled.build_programs(world, mesh, report, folder)
     state = iteration.start_student(world, state, mesh)
     return trainer.run_chunks(world, state, steps, report, programs)
 
@@ -253,7 +257,8 @@ def _run_stage(
 ) -> iteration.RunState:
     """Train from the first state, or from the newest checkpoint, to the last iteration."""
     c, first = world.config, steps.latest() or 0
-    programs = Programs(world, mesh, report)
+    folder = options.run_dir if options.profile else None
+    programs = profiled.build_programs(world, mesh, report, folder)
     if first < c.run.iterations:
         programs.get(min(c.run.chunk, c.run.iterations - first))
     state = _first_state(world, mesh, steps, options)

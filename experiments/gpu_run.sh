@@ -4,9 +4,10 @@
 #   experiments/gpu_run.sh pack FOLDER [--python 3.12] [-- TRAINING OPTIONS]
 #       here: this project as a wheel, and what such a machine has not, for x86-64; with training options
 #       also the kernels that MuJoCo Warp would otherwise compile there for a minute
-#   FOLDER/gpu_run.sh run OUT [--minutes 9] [--mib 16] [--from LEARNED.npz] -- TRAINING OPTIONS
+#   FOLDER/gpu_run.sh run OUT [--minutes 9] [--mib 16] [--from LEARNED.npz] [--profile] -- TRAINING OPTIONS
 #       there: install that apart, train until a minute before the end, and write to OUT the log and
-#       learned.npz, from which the next call goes on; no file there is above 16 MiB
+#       learned.npz, from which the next call goes on; no file there is above 16 MiB. With --profile
+#       also stages.json, the time of two iterations by stage, and their trace if it is small enough
 #
 # For example: gpu_run.sh run out --minutes 9 -- --terrain mixed --experiment robust --engine warp
 set -euo pipefail
@@ -45,12 +46,13 @@ pack() {
 }
 
 run() {
-  local out=${1:?run needs a folder to write to} minutes=9 mib=16 from="" begun start=() status=0
+  local out=${1:?run needs a folder to write to} minutes=9 mib=16 from="" begun start=() profile=() status=0
   begun=$(date +%s); shift
   while [ $# -gt 0 ] && [ "$1" != "--" ]; do
     case $1 in
+      --profile) profile=(--profile --run.chunk 2); shift; continue ;;
       --minutes) minutes=$2 ;; --mib) mib=$2 ;; --from) from=$2 ;;
-      *) fail "unknown option $1; known: --minutes, --mib, --from, and -- before those of train" ;;
+      *) fail "unknown option $1; known: --minutes, --mib, --from, --profile, and -- before those of train" ;;
     esac
     shift 2
   done
@@ -65,7 +67,7 @@ run() {
   python3 -c "import jax; print(jax.__version__, jax.devices())"
   [ -n "$from" ] && start=(--init "$from")
   [ -d "$work/checkpoints" ] && start=(--resume)
-  python3 -m cref_jax.train "$@" "${start[@]}" --run-dir "$work" --no-evaluate --no-tensorboard \
+  python3 -m cref_jax.train "$@" "${start[@]}" "${profile[@]}" --run-dir "$work" --no-evaluate --no-tensorboard \
     > "$out/train.log" 2>&1 &
   local training=$! last=$((begun + 60 * minutes - 60))
   while kill -0 $training 2>/dev/null && [ "$(date +%s)" -lt $last ]; do sleep 1; done
@@ -75,11 +77,14 @@ run() {
   [ "$status" -eq 0 ] || fail "training ended with $status; see $out/train.log"
   cp "$work/log.jsonl" "$work/config.json" "$work/origin.jsonl" "$out/"
   JAX_PLATFORMS=cpu python3 -m cref_jax.export --run "$work" --learner "$out/learned.npz"
+  [ ${#profile[@]} -eq 0 ] || cp "$work/stages.json" "$out/" || echo "no profile; see $out/train.log"
+  [ ! -f "$work/trace.json.gz" ] || [ -n "$(find "$work/trace.json.gz" -size +"$mib"M)" ] ||
+    cp "$work/trace.json.gz" "$out/"
   find "$out" -type f -size +"$mib"M -print -exec gzip -9 {} + | sed 's/^/above the limit, packed: /'
   echo "$(($(date +%s) - begun)) of $((60 * minutes)) s"
 }
 
 case ${1:-} in
   pack | run) "$@" ;;
-  *) sed -n '2,12s/^# \{0,1\}//p' "$0"; exit 2 ;;
+  *) sed -n '2,13s/^# \{0,1\}//p' "$0"; exit 2 ;;
 esac

@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 
 from cref_jax import gpu_program
-from cref_jax.benchmarks import hlo
+from cref_jax.benchmarks import hlo, source_stages
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 
@@ -35,7 +35,7 @@ FEED = ("cref_jax/training/camera_feed.py", "update_feed.<locals>.<lambda>")
     ],
 )
 def test_a_kernel_belongs_to_the_stage_of_its_functions(stack, stage):
-    assert gpu_program.stage_of(frames(*stack)) == stage
+    assert source_stages.stage_of(frames(*stack)) == stage
 
 
 class Counted(hlo.Program):

@@ -55,6 +55,7 @@ class Program:
     def __init__(self, text: str) -> None:
         self._computations: dict[str, dict[str, Instruction]] = {}
         self._tables: dict[str, dict[int, str]] = {name: {} for name in _TABLES}
+        self._stacks: dict[int, tuple[Frame, ...]] = {}  # by the number of the innermost frame
         self._entry = ""
         current, table = None, None
         for line in text.splitlines():
@@ -75,6 +76,25 @@ class Program:
         probability of the largest branch of a conditional.
         """
         yield from self._kernels(self._entry, 1.0, (), trip_count)
+
+    def stacks(self) -> dict[str, tuple[tuple[Frame, ...], ...]]:
+        """Map the name of each instruction to its own source stack and then those of its callers.
+
+        A computation that has several callers, such as a sum, belongs to the first.
+        """
+        result: dict[str, tuple[tuple[Frame, ...], ...]] = {}
+        entered = {self._entry}
+
+        def visit(computation: str, callers: tuple[tuple[Frame, ...], ...]) -> None:
+            for i in self._computations[computation].values():
+                result[i.name] = (self._stack(i), *callers)
+                for name in _find_names(i.attributes.partition(")")[2]):
+                    if name in self._computations and name not in entered:
+                        entered.add(name)
+                        visit(name, result[i.name])
+
+        visit(self._entry, ())
+        return result
 
     def _kernels(
         self, computation: str, times: float, loop: tuple[Frame, ...], trip_count: Callable
@@ -108,7 +128,13 @@ class Program:
         if not number and i.operation == "fusion":  # then a fused instruction has it
             inside = self._computations[_callee(i, "calls")].values()
             number = next((n for j in inside if (n := _find_id("stack_frame_id", j.attributes))), 0)
-        frames = []
+        return self._frames(number)
+
+    def _frames(self, number: int) -> tuple[Frame, ...]:
+        """Find the stack that begins with this frame; many instructions have the same."""
+        if number in self._stacks:
+            return self._stacks[number]
+        frames, first = [], number
         while number in self._tables["StackFrames"]:
             frame = self._tables["StackFrames"][number]
             place = self._tables["FileLocations"][_find_id("file_location_id", frame)]
@@ -116,7 +142,8 @@ class Program:
             function = self._tables["FunctionNames"][_find_id("function_name_id", place)].strip('"')
             frames.append(Frame(file, function))
             number = _find_id("parent_frame_id", frame) - 1  # printed with an offset of 1
-        return tuple(frames)
+        self._stacks[first] = tuple(frames)
+        return self._stacks[first]
 
     def _flops(self, computation: str, i: Instruction) -> int:
         """Count the FLOPs of the matrix products in one instruction."""

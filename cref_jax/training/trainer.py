@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import numpy as np
@@ -17,6 +17,8 @@ from cref_jax.training.progress import Reporter, SilentReporter
 
 MAX_UNSTABLE = 0.01  # share of an iteration's samples; assumed: more is systematic
 
+Program = Callable[[World, iteration.RunState], tuple[iteration.RunState, iteration.Log]]
+
 
 class Programs:
     """The compiled programs of chunks of iterations, by size."""
@@ -26,7 +28,7 @@ class Programs:
         self._shapes = iteration.state_shapes(world, mesh)
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
-    def get(self, size: int) -> jax.stages.Compiled:
+    def get(self, size: int) -> Program:
         """Compile the program of `size` iterations, once; report time and memory of the first.
 
         Raises:
