@@ -70,6 +70,7 @@ class ConditionResult(NamedTuple):
     noise: float  # m, deviation at 1 m
     scale: float
     dead: float  # share of the columns
+    view: tuple[float, float]  # deg, vertical and horizontal
     friction: float
     trials: int
     successes: int
@@ -154,6 +155,7 @@ def summarize_condition(
         noise=condition.disturbance.noise,
         scale=condition.disturbance.scale,
         dead=condition.disturbance.dead,
+        view=condition.disturbance.view,
         friction=condition.friction,
         trials=len(every),
         successes=count_successes(every),

@@ -150,7 +150,9 @@ def _depth(c: Config) -> dict[str, Any]:
         " guards.max_invalid of the pixels are unknown, the frame is not used",
         "window": c.camera.window,
         "resize": "the pixel that the middle of each cell falls into, of an image with this view; a"
-        " RealSense D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees",
+        " RealSense D435i has it at 848 x 480, not at 640 x 480, which shows 75 x 62 degrees: of"
+        " that a cell takes the pixel at the same tangents from the optical axis, and one outside"
+        " it is 0, invalid",
         "formula": "float16(nearest / d_max_m - 0.5), nearest: the smallest depth of the window x"
         " window pixels around, fewer at the border, after range and invalid",
     }

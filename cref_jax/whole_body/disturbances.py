@@ -6,10 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from cref_jax.config import Camera
+
 REGIONS = 3  # at most at a time; assumed
 REGION_FRAMES = (4, 20)  # range of their lifetime: 0.2 to 1 s at 20 Hz; assumed
 FARTHEST = 10.0  # m; noise grows up to this depth, so that far pixels and misses stay far; assumed
 WOBBLES = 5  # highest wave number of a region's outline; assumed
+VIEW_640 = (62.0, 75.0)  # deg, vertical, horizontal, of a D435i at 640 x 480; its data sheet
 
 Frame = Float[np.ndarray, "H W"]  # z-depth, m
 
@@ -23,6 +26,7 @@ class Disturbance(NamedTuple):
     noise: float = 0.0  # m, standard deviation at 1 m; grows with depth squared, as in stereo
     scale: float = 1.0  # reading / true depth
     dead: float = 0.0  # share of dead columns, fixed for a whole trial
+    view: tuple[float, float] = (180.0, 180.0)  # deg, as VIEW_640; pixels outside it read 0
     seed: int = 0  # of all random numbers here
 
 
@@ -32,8 +36,9 @@ UNDISTURBED = Disturbance()
 class Channel:
     """The channel of a trial's frames from the camera to the policy."""
 
-    def __init__(self, disturbance: Disturbance) -> None:
-        self._d = disturbance
+    def __init__(self, disturbance: Disturbance, view: tuple[float, float] = Camera().view) -> None:
+        """Set up the channel of frames with this view, deg, vertical and horizontal."""
+        self._d, self._view = disturbance, view
         # separate generators, so that one fault does not change the others
         self._losses, self._holes, self._errors = (
             np.random.default_rng([disturbance.seed, k]) for k in range(3)
@@ -61,7 +66,7 @@ class Channel:
         return None
 
     def _misread(self, frame: Frame) -> Frame:
-        """Apply scale error, noise and dead columns; without them, return the frame itself."""
+        """Apply scale error, noise, dead columns and a narrower view; without, return the frame."""
         d = self._d
         if d.scale != 1.0:
             frame = (d.scale * frame).astype(np.float32)
@@ -75,6 +80,9 @@ class Channel:
                 which = self._errors.permutation(frame.shape[1])[:count]
                 self._dead = np.isin(np.arange(frame.shape[1]), which)
             frame = np.where(self._dead, np.float32(0.0), frame)
+        if d.view != UNDISTURBED.view:
+            outside = find_outside(frame.shape, self._view, d.view)
+            frame = np.where(outside, np.float32(0.0), frame)
         return frame
 
     def _mask(self, shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
@@ -88,6 +96,21 @@ class Channel:
             self._blind = np.where(which >= 0, readings[which], np.float32(1.0))
         self._left -= 1
         return (self._blind == 0.0) | np.isnan(self._blind)
+
+
+def find_outside(
+    shape: tuple[int, int], view: tuple[float, float], shown: tuple[float, float]
+) -> Bool[np.ndarray, "H W"]:
+    """Compute the mask of pixels of a frame that look past what another camera shows.
+
+    Both views, deg, are vertical and horizontal and have one optical axis.
+    """
+    rows, columns = (
+        np.abs(2.0 * np.arange(count) + 1.0 - count) / count * math.tan(math.radians(0.5 * ours))
+        > math.tan(math.radians(0.5 * theirs))
+        for count, ours, theirs in zip(shape, view, shown, strict=True)
+    )
+    return rows[:, None] | columns
 
 
 def regions(

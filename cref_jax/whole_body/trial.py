@@ -65,7 +65,7 @@ class Episode:
         self.frame: Float[np.ndarray, "H W"] | None = None  # m, the newest that was delivered
         self._latency, self._perturbation = disturbance.latency, perturbation
         self._checker = TerminationChecker(body, self.state, start.speed)
-        self._channel = Channel(disturbance)
+        self._channel = Channel(disturbance, body.config.camera.view)
         self._before = body.robot.nominal_pose[body.driven]
         policy.reset()
 

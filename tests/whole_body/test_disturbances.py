@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from cref_jax.runtime.camera import Camera
+from cref_jax.runtime.tables import Table
 from cref_jax.whole_body import disturbances
 from cref_jax.whole_body.disturbances import Channel, Disturbance
 
@@ -127,6 +129,23 @@ def test_dead_columns_read_nothing_from_top_to_bottom_all_the_time():
     np.testing.assert_array_equal(blind(frames), np.broadcast_to(dead, frames.shape))
     other = sent(Disturbance(dead=0.1, seed=3), 1)[0]
     assert not np.array_equal(blind(other), blind(frames[0]))
+
+
+def test_a_stream_of_4_to_3_lacks_the_outer_columns_and_no_row():
+    (frame,) = sent(Disturbance(view=disturbances.VIEW_640), 1)
+    # The middle of column i is |2 i + 1 - 64| / 64 of tan 43.5 deg = 0.9490 from the axis. 75 deg
+    # show up to tan 37.5 deg = 0.7673, 0.8086 of it; column 5 is at 53 / 64 = 0.828, 6 at 0.797.
+    missing = np.isin(np.arange(64), [*range(6), *range(58, 64)])
+    np.testing.assert_array_equal(blind(frame), np.broadcast_to(missing, SHAPE))
+    np.testing.assert_array_equal(frame[:, ~missing], 2.0)
+
+
+def test_the_runtime_places_a_frame_of_640_x_480_with_the_same_pixels_missing():
+    view = {"vertical": 58.0, "horizontal": 87.0}
+    words = {"rows": 48, "columns": 64, "d_max_m": 3.0, "view_deg": view}
+    camera = Camera(Table(words, "depth"), 1e-3, 0.5)
+    placed = camera.resample(np.full((480, 640), 2.0, np.float32), disturbances.VIEW_640)
+    np.testing.assert_array_equal(placed, sent(Disturbance(view=disturbances.VIEW_640), 1)[0])
 
 
 def test_an_error_changes_nothing_else():
