@@ -16,6 +16,7 @@ import jax
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from cref_jax import cli
 from cref_jax.config import limits
@@ -26,6 +27,7 @@ from cref_jax.evaluation import (
     command_suite,
     crossing,
     failure_films,
+    highway_gate,
     paper_results,
     robustness_suite,
     scene_results,
@@ -41,7 +43,7 @@ from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain.generators import KINDS
 from cref_jax.training import run_dir
 
-Suite = Literal["table", "robust", "ood", "walk", "cross", "commands"]
+Suite = Literal["table", "robust", "ood", "walk", "cross", "commands", "gate"]
 PLAIN_SECONDS = 20.0  # between two lines where there is no terminal
 
 
@@ -61,13 +63,15 @@ class Options(cli.DebugOption):
     masses, friction, motors, delays, sensors, pushes and camera mount randomised, and with each of
     these alone; ood: twenty scenes outside the training distribution, in MuJoCo C by the numpy
     runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
-    to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping (default:
-    walk for a policy of flat ground, table for all others)"""
+    to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping; gate: the
+    highway gate by terrain, contact phase and posture (default: walk for a policy of flat ground,
+    table for all others)"""
     kind: Annotated[str, tyro.conf.arg(help=f"kind of lane to cross: {', '.join(KINDS)}")] = "gap"
     size: Annotated[float, Within(0, 100)] = 0.3
     """size of the obstacles, m; for a slope its gradient"""
     num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
-    """trials per cell, or episodes (default: 100 on a CPU, 2000 on an accelerator; 10 per scene)"""
+    """trials per cell, episodes or robots (default: 100 on a CPU, 2000 on an accelerator; 10 per
+    scene)"""
     stress: Annotated[int, Within(0, 1000)] = 2
     """trials per scene under each condition: lost, late and partly blind frames, friction"""
     film: str | None = None
@@ -109,7 +113,7 @@ def main(arguments: list[str] | None = None) -> None:
         started = time.monotonic()
         suites = {
             "table": _table, "robust": _robust, "ood": _ood, "cross": _cross, "walk": _walk,
-            "commands": _commands,
+            "commands": _commands, "gate": _gate,
         }  # fmt: skip
         found = suites[suite](subjects, options)
         record = {"suite": suite, "seed": options.seed, **_provenance(subjects)}
@@ -262,6 +266,22 @@ def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:
     console.print(command_suite.to_table(found))
     console.print(command_suite.describe(found), highlight=False)
     return found
+
+
+def _gate(subjects: list[Subject], options: Options) -> dict[str, Any]:
+    """Measure the highway gate, and print its mean in each state."""
+    policy, world = subjects[0].policy, subjects[0].world
+    count = _trials_per_cell(options)
+    rows = highway_gate.measure(policy.config, world, policy.train, count, options.seed)
+    table = Table(title="highway gate (1: memory)", box=None)
+    for title in ("group", "state", "steps", "mean", "quartiles"):
+        table.add_column(title, justify="left" if title in ("group", "state") else "right")
+    for row in rows:
+        numbers = [f"{row[key]:.3f}" for key in ("mean", "q25", "q75") if row["n"]] or ["-"] * 3
+        spread = " to ".join(numbers[1:])
+        table.add_row(row["group"], row["state"], f"{row['n']:,}", numbers[0], spread)
+    Console().print(table)
+    return {"rule": highway_gate.RULE, "robots": count, "gate": rows}
 
 
 def _provenance(subjects: list[Subject]) -> dict[str, Any]:

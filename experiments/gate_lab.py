@@ -15,38 +15,26 @@ The paper finds higher gates on stairs than on flat ground, in flight than in su
 than in stable postures. n counts steps of 20 ms over all robots, which are far from independent.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
-import jax.numpy as jnp
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 
 from cref_jax import cli
-from cref_jax.config import Config
 from cref_jax.env.world import World
-from cref_jax.errors import ConfigError
-from cref_jax.evaluation import recorder
-from cref_jax.evaluation.recorder import Moment, StepRecords
+from cref_jax.evaluation import highway_gate, recorder
+from cref_jax.evaluation.highway_gate import FEW, GROUPS, Row
+from cref_jax.evaluation.recorder import StepRecords
 from cref_jax.system import jax_setup
 from cref_jax.terrain import Terrain, cross_section
 
-RISKY = 0.20  # rad, |roll| or |pitch| above it, Sec. III-B
-WARM_UP = 1.0  # s; assumed: the memory is empty at first and the robot stands
-FEW = 100  # steps; smaller groups are marked
-GROUPS = {
-    "terrain": ("flat", "stairs up", "stairs down", "gap", "platform", "rough", "slope"),
-    "phase": ("flight", "single support", "double support"),
-    "posture": ("stable", "risky"),
-}
 COLUMNS = ("group", "state", "n", "robots", "mean", "q25", "median", "q75", "note")
 
 
@@ -66,32 +54,6 @@ class Options(recorder.Options):
     """image to write; the table is written beside it as .csv"""
 
 
-class Step(NamedTuple):
-    """Data recorded per control step of E robots; the state is that before the step."""
-
-    gate: Float[Array, "E 3"]  # over channels: mean, 10th and 90th percentile
-    airborne: Bool[Array, "E F"]
-    pose: Float[Array, "E 7"]  # of the base: m, quaternion
-
-
-class Row(NamedTuple):
-    """Statistics of the gate in one state."""
-
-    group: str
-    state: str
-    n: int  # steps over all robots
-    robots: int
-    mean: float
-    q25: float
-    median: float
-    q75: float
-
-    @property
-    def note(self) -> str:
-        """A warning for small groups."""
-        return f"n below {FEW}" if self.n < FEW else ""
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; a user error prints one line and exits with code 2."""
     with cli.one_line_errors(arguments):
@@ -100,14 +62,16 @@ def main(arguments: list[str] | None = None) -> None:
         out = cli.prepare_output(options.out, ".png")
         policy, world = recorder.open_policy(options.run, options.policy, options.engine)
         c = policy.config
-        check_variant(c)
+        highway_gate.check_variant(c)
+        if c.network.variant == "blind":
+            print("blind policy: its gate blends memory with proprioception, without depth")
         kind = recorder.choose_kind(c, options.kind)
         world = recorder.make_trial_world(c, world, recorder.medium_lanes(c), options.command)
         count = recorder.default_num_envs(options.num_envs, on_accelerator=4096)
         robots = recorder.start_robots(world, options.seed, count)
         steps = recorder.count_steps(options.seconds, c)
-        watched = recorder.record(world, policy.train, robots, steps, record_step)
-        rows = list(make_rows(world, watched))
+        watched = recorder.record(world, policy.train, robots, steps, highway_gate.record_step)
+        rows = list(highway_gate.make_rows(world, watched))
         recorder.write_csv(
             out.with_suffix(".csv"), COLUMNS, ((*row, row.note) for row in rows if row.n)
         )
@@ -115,67 +79,6 @@ def main(arguments: list[str] | None = None) -> None:
         for row in rows:
             print(format_row(row))
         print(f"wrote {out} and {out.with_suffix('.csv')}")
-
-
-def check_variant(c: Config) -> None:
-    """Check that the policy has a gate; print the inputs of a blind policy's gate.
-
-    Raises:
-        ConfigError: it has none.
-    """
-    if c.network.variant == "no_highway":
-        raise ConfigError("this policy has no gate: its variant is 'no_highway'; use another")
-    if c.network.variant == "blind":
-        print("blind policy: its gate blends memory with proprioception, without depth")
-
-
-def record_step(world: World, moment: Moment) -> Step:
-    """Record the gate and the state for which it was computed."""
-    state, gate = moment.robots.env, moment.policy.gate[0]
-    low, high = jnp.percentile(gate, jnp.array([10.0, 90.0]), axis=1)
-    return Step(
-        gate=jnp.stack([gate.mean(axis=1), low, high], axis=1),
-        airborne=~state.gait.down,
-        pose=state.body.qpos[:, :7],
-    )
-
-
-def make_rows(world: World, watched: StepRecords) -> Iterator[Row]:
-    """Yield the gate statistics of each state of each group."""
-    seen = watched.seen
-    counted = watched.alive.copy()
-    counted[: round(WARM_UP / world.config.physics.control_period)] = False
-    states = {
-        "terrain": recorder.terrain_under(world.lanes, seen.pose[..., 0]),
-        "phase": contact_phases(seen.airborne),
-        "posture": postures(seen.pose[..., 3:]),
-    }
-    for group, names in GROUPS.items():
-        for name in names:
-            yield summarize_state(group, name, seen.gate[..., 0], counted & (states[group] == name))
-
-
-def summarize_state(
-    group: str, state: str, gate: Float[np.ndarray, "T E"], where: Bool[np.ndarray, "T E"]
-) -> Row:
-    """Summarise the gate over the steps of one state; NaN without steps."""
-    x = gate[where].astype(np.float64)
-    quartiles = np.percentile(x, (25, 50, 75)) if x.size else np.full(3, np.nan)
-    mean = float(x.mean()) if x.size else float("nan")
-    return Row(group, state, x.size, int(where.any(axis=0).sum()), mean, *map(float, quartiles))
-
-
-def contact_phases(airborne: Bool[np.ndarray, "*n F"]) -> Shaped[np.ndarray, "*n"]:
-    """Name the contact phase: double support, single support or flight."""
-    return np.array(["double support", "single support", "flight"])[airborne.sum(axis=-1)]
-
-
-def postures(rotation: Float[np.ndarray, "*n 4"]) -> Shaped[np.ndarray, "*n"]:
-    """Name the posture: risky if |roll| or |pitch| of the base is above RISKY, else stable."""
-    w, x, y, z = np.moveaxis(rotation, -1, 0)
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
-    return np.where((np.abs(roll) > RISKY) | (np.abs(pitch) > RISKY), "risky", "stable")
 
 
 def format_row(row: Row) -> str:

@@ -25,6 +25,7 @@ TITLES = {
     "cross": "Crossing obstacles",
     "robust": "Success under full randomisation",
     "commands": "Following commands on flat ground",
+    "gate": "The highway gate by terrain, contact phase and posture",
 }
 PLAIN = {  # record key of the suites walk and cross: (label, unit)
     "kind": ("kind of obstacle", ""),
@@ -103,6 +104,8 @@ def _make_sections(record: Record, folder: Path | None) -> Iterator[Section]:
         yield Section("One randomised part at a time", evaluation_tables.part_table(rates))
     if record.get("commands"):
         yield Section("Commands", evaluation_tables.command_table(record["commands"]))
+    if record.get("gate"):
+        yield Section("Highway gate", evaluation_tables.gate_table(record["gate"]))
     if record.get("conditions"):
         yield Section("Conditions", _condition_table(record["conditions"]))
     plain = _plain_body(record)

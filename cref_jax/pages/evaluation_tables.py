@@ -47,3 +47,23 @@ def command_table(rows: Sequence[Row]) -> Html:
         for row in rows
     ]
     return markup.table(columns, table)
+
+
+def gate_table(rows: Sequence[Row]) -> Html:
+    """Build the table of the highway gate per state of each group."""
+    columns = [Column("group"), Column("state")]
+    columns += [Column(n, True) for n in ("steps", "robots", "mean", "median", "quartiles")]
+    number = lambda x: MISSING if x is None else f"{x:.3f}"
+    table = [
+        (
+            str(row["group"]),
+            str(row["state"]),
+            f"{row['n']:,}",
+            str(row["robots"]),
+            number(row["mean"]),
+            number(row["median"]),
+            MISSING if row["q25"] is None else f"{row['q25']:.3f} to {row['q75']:.3f}",
+        )
+        for row in rows
+    ]
+    return markup.table(columns, table)

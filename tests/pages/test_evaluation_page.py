@@ -218,3 +218,16 @@ def test_a_browser_shows_the_cells_and_has_nothing_to_complain_about(tmp_path):
     # the page's own policy stops what would leave it, and the browser says so
     path.write_text(path.read_text().replace("<main>", '<main><img src="http://127.0.0.1:9/x">'))
     assert "violates" in " ".join(shown(path)[1])
+
+
+def test_the_gate_of_every_state_is_shown(tmp_path):
+    rows = [
+        {"group": "phase", "state": "flight", "n": 1234, "robots": 9, "mean": 0.4126, "q25": 0.3,
+         "median": 0.41, "q75": 0.5},
+        {"group": "posture", "state": "risky", "n": 0, "robots": 0, "mean": None, "q25": None,
+         "median": None, "q75": None},
+    ]  # fmt: skip
+    seen = written({"suite": "gate", "rule": "the rule", "gate": rows}, tmp_path)
+    expected = ["phase", "flight", "1,234", "9", "0.413", "0.410", "0.300 to 0.500"]
+    assert row(seen, "phase") == expected
+    assert row(seen, "posture") == ["posture", "risky", "0", "0", "-", "-", "-"]
