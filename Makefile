@@ -33,6 +33,9 @@ play: $(READY)  ## watch a policy: ARGS="--run runs/NAME"
 report: $(READY)  ## gather a run into one page: ARGS="--run runs/NAME"
 	$(BIN)/python -m cref_jax.report $(ARGS)
 
+reproduce: $(READY)  ## train variants x seeds, and put their tables beside the paper's: ARGS="--plan"
+	$(BIN)/python -m cref_jax.reproduce $(ARGS)
+
 export: $(READY)  ## write a policy for the robot: ARGS="--run runs/NAME --out policy"
 	$(BIN)/python -m cref_jax.export $(ARGS)
 

@@ -21,6 +21,7 @@ COMMANDS = (
     "gpu_program",
     "params",
     "doctor",
+    "reproduce",
 )
 DEMO = ("play", "--live", "--browser", "--policy", "robust")  # needs no training
 

@@ -5,14 +5,12 @@ import cref_jax.system.startup  # noqa: F401
 import typing
 from dataclasses import dataclass
 
-import jax
 from rich.console import Console
 from rich.table import Table
 
 from cref_jax import cli, config
 from cref_jax.config import Config, presets
-from cref_jax.env.world import build_world
-from cref_jax.training import iteration
+from cref_jax.training.parameter_count import count_parameters
 
 
 @dataclass(frozen=True)
@@ -24,18 +22,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line."""
     with cli.one_line_errors(arguments):
         cli.parse(Options, arguments, "params")
-        Console().print(
-            build_table({name: count_parameters(name) for name in typing.get_args(config.Variant)})
-        )
-
-
-def count_parameters(variant: config.Variant) -> dict[str, int]:
-    """Count the parameters of each module of the actor, and of the critic, in its experiment."""
-    c = config.override(presets.apply_file(Config(), variant), {"run": {"num_envs": 4}})
-    params = jax.eval_shape(iteration.initial_state, build_world(c)).train.params
-    size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))
-    parts = {part: size(tree) for part, tree in params.actor["params"].items()}
-    return {**parts, "critic": size(params.critic)}
+        names = typing.get_args(config.Variant)
+        configs = {name: presets.apply_file(Config(), name) for name in names}
+        Console().print(build_table(count_parameters(configs)))
 
 
 def build_table(counts: dict[str, dict[str, int]]) -> Table:

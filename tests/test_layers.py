@@ -26,7 +26,7 @@ FLOORS = [
     {"training", "whole_body"},
     {"policy", "benchmarks"},
     {"evaluation"},
-    {"live"},
+    {"live", "reproduction"},
 ]
 
 WALLS = [  # a room, what it may not reach through any number of imports, and why

@@ -3,12 +3,13 @@
 import typing
 
 from cref_jax import config, params
+from cref_jax.config import Config, presets
+from cref_jax.training.parameter_count import count_parameters
 
 
 def test_the_count_of_each_variant_is_that_of_its_layers():
-    counts = {
-        variant: params.count_parameters(variant) for variant in typing.get_args(config.Variant)
-    }
+    names = typing.get_args(config.Variant)
+    counts = count_parameters({name: presets.apply_file(Config(), name) for name in names})
     full, d = counts["full"], 128
     # norm 2 d, query, key, value and output d x d
     assert full["cross_attention"] == 2 * d + 4 * d * d

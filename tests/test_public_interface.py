@@ -15,7 +15,7 @@ from cref_jax.policy import sources
 
 COMMANDS = (
     "train", "eval", "play", "export", "sim2sim", "report", "bench", "params", "gpu_program",
-    "doctor",
+    "doctor", "reproduce",
 )  # fmt: skip
 SETTINGS = {
     "run": "Run", "robot": "Robot", "physics": "Physics", "terrain": "Terrain",

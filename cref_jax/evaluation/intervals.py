@@ -2,7 +2,8 @@
 
 A rate has Wilson's score interval. The intervals of a difference and of a mean are built from it
 (R. Newcombe, "Interval estimation for the difference between independent proportions", Statistics
-in Medicine 17, 1998, method 10; for sums the same), so they hold near 0 and 1 as well.
+in Medicine 17, 1998, method 10; for sums the same), so they hold near 0 and 1 as well. The
+mean over a few seeds of one training has Student's t interval.
 """
 
 import math
@@ -10,6 +11,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 Z = 1.959964  # standard deviations, half the central 95 % of a normal distribution
+STUDENT = (12.7062, 4.3027, 3.1824, 2.7764, 2.5706, 2.4469, 2.3646, 2.3060, 2.2622)
+"""97.5 % quantiles of Student's distribution with 1, 2, ... degrees of freedom"""
+MOST_VALUES = len(STUDENT) + 1  # of which a mean is taken
 
 
 class Rate(NamedTuple):
@@ -54,3 +58,20 @@ def mean(rates: Sequence[Rate]) -> Rate:
 def is_significant(gap: Rate) -> bool:
     """Check whether the interval of a difference excludes zero."""
     return not gap.low <= 0.0 <= gap.high
+
+
+def mean_of_few(values: Sequence[float]) -> Rate | None:
+    """Compute the mean of independent values with Student's t interval; None for a single one.
+
+    Raises:
+        ValueError: there is none, or more than MOST_VALUES.
+    """
+    count = len(values)
+    if not 1 <= count <= MOST_VALUES:
+        raise ValueError(f"1 to {MOST_VALUES} values, not {count}")
+    if count == 1:
+        return None
+    value = sum(values) / count
+    variance = sum((x - value) ** 2 for x in values) / (count - 1)
+    half = STUDENT[count - 2] * math.sqrt(variance / count)
+    return Rate(value, value - half, value + half)

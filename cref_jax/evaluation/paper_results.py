@@ -6,6 +6,7 @@ Success is in percent of `TRIALS` trials per cell; obstacle sizes are in terrain
 from collections.abc import Mapping
 from typing import NamedTuple
 
+SAMPLES = 20_000 * 4096 * 24  # of training: iterations, robots (Sec. II-D), horizon (assumed)
 TRIALS = 2000  # per cell; half of those on stairs go up, half down
 KINDS = ("stairs", "gap", "platform")
 LEVELS = ("easy", "medium", "hard", "ood")  # the last is outside the training range
@@ -60,6 +61,15 @@ METHODS = {
         (29, 62, 136, 235, 241, 338, 493, 959), 1, 74.57,
     ),
 }  # fmt: skip
+VARIANTS = {  # name here: row of Tables II and III
+    "full": FULL,
+    "no_cross_attention": "w/o Cross-Attn",
+    "no_grf": "w/o GRF",
+    "no_highway": "w/o Highway Gate",
+    "hpl": "HPL",
+}
+DESCENT_MAD = {"full": 0.014, "foot_contact_quality": 0.028, "no_foothold_reward": 0.098}
+"""m, median absolute deviation of touchdowns going down hard stairs, Sec. III-B"""
 
 
 def overall(success: Mapping[Cell, float]) -> float:

@@ -60,3 +60,12 @@ def test_the_interval_of_a_mean_covers_it_as_often_as_it_says():
 
 def test_the_mean_of_one_rate_is_itself():
     assert intervals.mean([wilson(3, 9)]) == pytest.approx(wilson(3, 9))
+
+
+@pytest.mark.parametrize("count", range(2, intervals.MOST_VALUES + 1))
+def test_the_mean_of_a_few_values_has_students_interval(count):
+    values = [0.5 + 0.1 * (-1) ** k * k for k in range(count)]
+    found = intervals.mean_of_few(values)
+    low, high = stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values))
+    assert found == pytest.approx((np.mean(values), low, high), abs=1e-4)
+    assert intervals.mean_of_few(values[:1]) is None

@@ -1,0 +1,1 @@
+"""A plan of trainings: variants and seeds, one after the other, and the tables of their results."""
