@@ -17,7 +17,7 @@ from rich.table import Table
 from cref_jax import cli
 from cref_jax.config import limits
 from cref_jax.config.ranges import Within
-from cref_jax.errors import TrainingError
+from cref_jax.errors import ConfigError, TrainingError
 from cref_jax.pages import reproduction_page
 from cref_jax.reproduction import plan as planning
 from cref_jax.reproduction import progress, results
@@ -67,10 +67,10 @@ def main(arguments: list[str] | None = None) -> None:
         device = planning.choose_device(o.device)
         jax.config.update("jax_platforms", "cpu")  # an accelerator is left to the trainings
         jax_setup.prepare()
-        words = shlex.split(o.settings)
         plan = planning.build(
-            o.variants, o.seeds, o.terrain, device, o.trials, o.samples, o.num_envs, words
-        )
+            o.variants, o.seeds, o.terrain, device, o.trials, o.samples, o.num_envs,
+            _split_words(o.settings),
+        )  # fmt: skip
         planning.check(o.out, plan)
         if o.plan:
             print_plan(o.out, plan)
@@ -100,6 +100,13 @@ def reproduce(folder: Path, plan: Plan, runner: Runner) -> None:
     if runner.signal is None:
         _say(f"all {len(plan.rows)} rows are finished")
     _say(f"wrote {folder / RESULT} and {(folder / RESULT).with_suffix('.html')}")
+
+
+def _split_words(settings: str) -> list[str]:
+    try:
+        return shlex.split(settings)
+    except ValueError as error:
+        raise ConfigError(f"--settings {settings}: {error}") from None
 
 
 def _complete_row(folder: Path, plan: Plan, row: Row, runner: Runner, place: str) -> None:

@@ -153,6 +153,8 @@ def check(folder: Path, plan: Plan) -> None:
         return
     except (OSError, ValueError, AttributeError) as error:
         raise ConfigError(f"{path}: {error}") from None
+    asked = [text for text in differences if not text.startswith("configs.")]
+    differences = asked or differences  # settings follow from what was asked for
     if differences:
         more = len(differences) - MOST_NAMED
         each = "; ".join(differences[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")

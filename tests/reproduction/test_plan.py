@@ -83,7 +83,8 @@ def test_eval_takes_the_words_that_it_is_given(tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"trials": 20}, "trials 10, not 20"),
+        ({"trials": 20}, "trials 10, not 20; choose another --out"),
+        ({"trials": 9, "samples": 10e6}, "trials 10, not 9; choose another --out"),
         ({"seeds": (0,)}, "seeds 0 4, not 0"),
         ({"variants": ("full",)}, "variants full hpl, not full"),
         ({"samples": 10e6}, "configs.full.run.iterations 3256, not 1628"),

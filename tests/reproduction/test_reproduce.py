@@ -34,7 +34,7 @@ def run(folder, plan, **kills):
     return runner
 
 
-def test_a_plan_killed_twice_at_any_step_gives_the_same_tables(tmp_path, plan, monkeypatch):
+def test_a_plan_killed_twice_gives_the_same_tables(tmp_path, plan, monkeypatch):
     monkeypatch.setattr(reproduce.reproduction_page, "write", lambda *_: None)
     straight = run(tmp_path / "straight", plan)
     # four iterations per row; two suites, one for the variant without a gate
@@ -78,6 +78,12 @@ def test_a_training_that_fails_is_named(tmp_path, plan, monkeypatch):
     monkeypatch.setattr(FakeRunner, "run", lambda *_: 1)
     with pytest.raises(TrainingError, match="row 1 of 6, full-seed0: train has ended with exit"):
         run(tmp_path, plan)
+
+
+def test_settings_whose_quotes_are_open_are_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        reproduce.main(["--plan", "--out", str(tmp_path / "out"), '--settings="--ppo.epochs 3'])
+    assert capsys.readouterr().err == 'error: --settings "--ppo.epochs 3: No closing quotation\n'
 
 
 def test_the_plan_is_printed_and_nothing_is_written(tmp_path, capsys):
