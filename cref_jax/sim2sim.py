@@ -29,7 +29,7 @@ from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.rendering import robot_scene, video
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain.generators import KINDS
-from cref_jax.whole_body.disturbances import Disturbance
+from cref_jax.whole_body.disturbances import Disturbance, sample_disturbance
 from cref_jax.whole_body.ground import Lane
 from cref_jax.whole_body.randomization import Perturbation, sample_deviation
 from cref_jax.whole_body.simulator import WholeBodySim
@@ -57,7 +57,8 @@ class Options(cli.DebugOption):
     latency: Annotated[float, Within(0, 10)] = 0.02
     """s from the exposure of a frame until the policy has it"""
     randomised: bool = False
-    """vary the robot in each trial, with sensor noise and pushes, as `eval --suite robust` does"""
+    """vary the robot in each trial, with sensor noise, pushes and faults of the camera, as
+    `eval --suite robust` does"""
     compare: bool = False
     """also evaluate the same trials in the training simulation"""
     table: bool = False
@@ -159,18 +160,19 @@ class _Walker:
         self._contents = deploy.contents(path)
         joints = deploy.Policy(*self._contents).joints.names
         self._bodies = [WholeBodySim(c, lane, joints) for lane in lanes]
-        late = max(0, round(options.latency / c.physics.control_period))
-        self._disturbance = Disturbance(latency=late)
+        self._late = max(0, round(options.latency / c.physics.control_period))
         self._config, self._options = protocol.randomise(c), options
 
     def __call__(self, job: tuple[Start, int, int]) -> Trial:
         start, level, number = job
         policy, body, perturbation = deploy.Policy(*self._contents), self._bodies[level], None
+        disturbance = Disturbance(latency=self._late)
         if self._options.randomised:
             rng = np.random.default_rng([self._options.seed, number])
             body = body.deviate(sample_deviation(self._config, len(body.driven), rng))
             perturbation = Perturbation(self._config, rng)
-        return run_trial(body, policy, start, TRIAL_SECONDS, self._disturbance, perturbation)
+            disturbance = sample_disturbance(self._config.randomisation, self._late, rng)
+        return run_trial(body, policy, start, TRIAL_SECONDS, disturbance, perturbation)
 
 
 def summarize(trials: list[Trial], options: Options) -> LaneResult:

@@ -3,12 +3,21 @@
 from cref_jax.config.learning import HPL, PPO, Distillation, Network, Run, Variant
 from cref_jax.config.overrides import describe_unknown, load_toml, override
 from cref_jax.config.settings import Config
-from cref_jax.config.simulation import Camera, Foothold, Physics, Robot, Scan, Terrain
+from cref_jax.config.simulation import (
+    NARROW_VIEW,
+    Camera,
+    Foothold,
+    Physics,
+    Robot,
+    Scan,
+    Terrain,
+)
 from cref_jax.config.task import Command, Curriculum, Episode, Randomisation, Reward, RewardWeights
 from cref_jax.errors import ConfigError
 
 __all__ = [
     "HPL",
+    "NARROW_VIEW",
     "PPO",
     "Camera",
     "Command",

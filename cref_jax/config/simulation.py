@@ -67,6 +67,9 @@ class Scan:
     clip: float = 1.0  # m; assumed
 
 
+NARROW_VIEW = (62.0, 75.0)  # deg, vertical, horizontal, of a D435i at 640 x 480; its data sheet
+
+
 @dataclass(frozen=True)
 class Camera:
     """The depth camera, a RealSense D435i looking down at the ground ahead (Sec. III-A)."""

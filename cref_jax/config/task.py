@@ -108,6 +108,12 @@ class Randomisation:
     structures: int = 0
     """Capsules per episode in the depth image alone: rails, walls, posts and bars beside and over
     the lane"""
+    depth_noise: float = 0.0
+    """m, deviation of depth at 1 m, up to; grows with depth squared, as in stereo"""
+    depth_scale: float = 0.0  # +-, share by which all depths are wrong
+    depth_dead: float = 0.0  # share of dead columns, up to
+    depth_holes: float = 0.0  # share of the image without a reading, up to
+    narrow_view: float = 0.0  # chance of a camera that shows 75 x 62 deg, as at 640 x 480
     push_yaw_rate: float = 0.0  # rad/s, up to, with each push, as of a wrist that meets a rail
     ramp: bool = False  # begin with none of it, and let it grow with competence
     ramp_falls: tuple[float, float] = (2.5, 4.0)  # per minute: fewer raise, more lower; assumed

@@ -15,6 +15,7 @@ from cref_jax import config, depth, geometry, terrain
 from cref_jax.env import (
     commands,
     curriculum,
+    depth_faults,
     events,
     footholds,
     gait,
@@ -190,9 +191,11 @@ def _reset_if_over(
 
 
 def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Float[Array, "H W"]:
-    """Render D, the normalised depth image of the ground and of the robot's own links."""
+    """Render D, the normalised depth image of ground and links, with the camera's faults."""
     camera = world.config.camera
     metres = render_depth(world, state, is_profile)
+    if depth_faults.has_faults(world.config.randomisation):
+        metres = depth_faults.misread(world, state, metres)
     return depth.normalize(depth.min_filter(metres, camera.window), camera)
 
 

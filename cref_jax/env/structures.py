@@ -20,13 +20,18 @@ ABSENT = np.array([0.0, 0.0, -100.0, 0.0, 0.0, -100.0, 0.0], np.float32)  # far 
 
 def sample_structures(world: World, state: EnvState) -> Float[Array, "S 7"]:
     """Draw the capsules of an episode: both ends and radius, m, in the lane's coordinates."""
-    place = jax.lax.bitcast_convert_type(state.start, jnp.uint32)
-    key = jax.random.key(world.config.terrain.seed)
-    for number in (*place, state.kind):
-        key = jax.random.fold_in(key, number)
-    keys = jax.random.split(key, world.config.randomisation.structures)
+    keys = jax.random.split(episode_key(world, state), world.config.randomisation.structures)
     ground = world.lanes.tile(state.level, state.kind, state.variant)
     return jax.vmap(lambda k: _sample_structure(ground, world.lanes.end, k))(keys)
+
+
+def episode_key(world: World, state: EnvState, salt: int | None = None) -> PRNGKeyArray:
+    """Derive the random key of an episode from where it began."""
+    place = jax.lax.bitcast_convert_type(state.start, jnp.uint32)
+    key = jax.random.key(world.config.terrain.seed)
+    for number in (*place, state.kind, *(() if salt is None else (salt,))):
+        key = jax.random.fold_in(key, number)
+    return key
 
 
 def _sample_structure(

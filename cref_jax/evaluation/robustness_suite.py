@@ -21,10 +21,19 @@ from cref_jax.physics.simulation import Physics
 
 EVERYTHING = "everything"
 STRUCTURES = "structures"
-PARTS = (*Spread._fields, STRUCTURES)
+DEPTH = "depth"
+PARTS = (*Spread._fields, STRUCTURES, DEPTH)
 RAILS = {"structures": 8, "push_yaw_rate": 1.0}
 """Capsules in the depth image, and rad/s by which pushes turn the robot, as if a wrist caught on a
 rail; as in experiments/robust.toml"""
+NO_FAULTS = dict.fromkeys(protocol.DEPTH_FAULTS, 0.0)
+WORLDS: tuple[tuple[tuple[str, ...], dict[str, float]], ...] = (
+    ((EVERYTHING, STRUCTURES), {}),
+    ((DEPTH,), {"structures": 0, "camera_pitch": 0.0, "camera_position": 0.0}),
+    (Spread._fields, {"structures": 0, **NO_FAULTS}),
+)
+"""Parts, and what is changed in the randomisation of their world. A spread of `camera` decides how
+large faults of depth are, so that `STRUCTURES` has none."""
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper_results.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs are not tested there
@@ -80,9 +89,9 @@ def run_rows(
 ) -> list[dict[str, Any]]:
     """Run `count` trials per row; `on_finished(n)` is called as trials end."""
     every = list(selected or list_rows())
-    bare = w.replace(config=override(w.config, {"randomisation": {"structures": 0}}))
     found = {}
-    for world, parts in ((w, (EVERYTHING, STRUCTURES)), (bare, Spread._fields)):
+    for parts, changes in WORLDS:
+        world = w.replace(config=override(w.config, {"randomisation": changes}))
         rows = [row for row in every if row.part in parts]
         if rows:
             found |= dict(
@@ -172,7 +181,9 @@ def parts_table(results: Sequence[dict[str, Any]]) -> Table:
 def _spread(part: str) -> Spread:
     if part == EVERYTHING:
         return Spread(*[np.float32(1.0)] * len(Spread._fields))
-    return Spread(*(np.float32(name == part) for name in Spread._fields))
+    # faults of depth are as large as `camera` says
+    own = "camera" if part == DEPTH else part
+    return Spread(*(np.float32(name == own) for name in Spread._fields))
 
 
 def _describe(row: Row) -> dict[str, Any]:

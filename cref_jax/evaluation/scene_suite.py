@@ -18,7 +18,7 @@ import numpy as np
 from rich.progress import track
 
 from cref_jax import deploy, robot
-from cref_jax.config import Config
+from cref_jax.config import NARROW_VIEW, Config
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import lateral_drift, protocol, scene_results
 from cref_jax.evaluation.protocol import COMMANDS, TRIAL_SECONDS
@@ -28,7 +28,7 @@ from cref_jax.rendering import robot_scene
 from cref_jax.rendering.video import write_video
 from cref_jax.system import parallel
 from cref_jax.whole_body import scene_files
-from cref_jax.whole_body.disturbances import UNDISTURBED, VIEW_640, Disturbance
+from cref_jax.whole_body.disturbances import UNDISTURBED, Disturbance
 from cref_jax.whole_body.scene_files import Scene
 from cref_jax.whole_body.simulator import WholeBodySim
 from cref_jax.whole_body.trial import Start, Trial, run_trial
@@ -50,7 +50,7 @@ CONDITIONS = (
     *(Condition(f"noise of {100 * n:g} cm at 1 m", Disturbance(noise=n)) for n in (0.005, 0.02)),
     *(Condition(f"depth times {k}", Disturbance(scale=k)) for k in (0.95, 1.05)),
     Condition("a tenth of the columns dead", Disturbance(dead=0.1)),
-    Condition("a stream of 640 x 480", Disturbance(view=VIEW_640)),
+    Condition("a stream of 640 x 480", Disturbance(view=NARROW_VIEW)),
     *(Condition(f"friction {mu}", friction=mu) for mu in (0.4, 0.6, 0.8, 1.0)),
 )  # latency assumes control steps of 20 ms, Sec. II-D
 

@@ -6,13 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from cref_jax.config import Camera
+from cref_jax.config import NARROW_VIEW, Camera, Randomisation
 
 REGIONS = 3  # at most at a time; assumed
 REGION_FRAMES = (4, 20)  # range of their lifetime: 0.2 to 1 s at 20 Hz; assumed
 FARTHEST = 10.0  # m; noise grows up to this depth, so that far pixels and misses stay far; assumed
 WOBBLES = 5  # highest wave number of a region's outline; assumed
-VIEW_640 = (62.0, 75.0)  # deg, vertical, horizontal, of a D435i at 640 x 480; its data sheet
 
 Frame = Float[np.ndarray, "H W"]  # z-depth, m
 
@@ -26,11 +25,24 @@ class Disturbance(NamedTuple):
     noise: float = 0.0  # m, standard deviation at 1 m; grows with depth squared, as in stereo
     scale: float = 1.0  # reading / true depth
     dead: float = 0.0  # share of dead columns, fixed for a whole trial
-    view: tuple[float, float] = (180.0, 180.0)  # deg, as VIEW_640; pixels outside it read 0
+    view: tuple[float, float] = (180.0, 180.0)  # deg, as NARROW_VIEW; pixels outside it read 0
     seed: int = 0  # of all random numbers here
 
 
 UNDISTURBED = Disturbance()
+
+
+def sample_disturbance(c: Randomisation, latency: int, rng: np.random.Generator) -> Disturbance:
+    """Sample a camera with the ranges of training."""
+    return Disturbance(
+        latency=latency,
+        invalid=rng.uniform(0.0, c.depth_holes),
+        noise=rng.uniform(0.0, c.depth_noise),
+        scale=1.0 + rng.uniform(-c.depth_scale, c.depth_scale),
+        dead=rng.uniform(0.0, c.depth_dead),
+        view=NARROW_VIEW if rng.random() < c.narrow_view else UNDISTURBED.view,
+        seed=int(rng.integers(2**31)),
+    )
 
 
 class Channel:

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from cref_jax.config import NARROW_VIEW, Randomisation
 from cref_jax.runtime.camera import Camera
 from cref_jax.runtime.tables import Table
 from cref_jax.whole_body import disturbances
@@ -132,7 +133,7 @@ def test_dead_columns_read_nothing_from_top_to_bottom_all_the_time():
 
 
 def test_a_stream_of_4_to_3_lacks_the_outer_columns_and_no_row():
-    (frame,) = sent(Disturbance(view=disturbances.VIEW_640), 1)
+    (frame,) = sent(Disturbance(view=NARROW_VIEW), 1)
     # The middle of column i is |2 i + 1 - 64| / 64 of tan 43.5 deg = 0.9490 from the axis. 75 deg
     # show up to tan 37.5 deg = 0.7673, 0.8086 of it; column 5 is at 53 / 64 = 0.828, 6 at 0.797.
     missing = np.isin(np.arange(64), [*range(6), *range(58, 64)])
@@ -144,8 +145,8 @@ def test_the_runtime_places_a_frame_of_640_x_480_with_the_same_pixels_missing():
     view = {"vertical": 58.0, "horizontal": 87.0}
     words = {"rows": 48, "columns": 64, "d_max_m": 3.0, "view_deg": view}
     camera = Camera(Table(words, "depth"), 1e-3, 0.5)
-    placed = camera.resample(np.full((480, 640), 2.0, np.float32), disturbances.VIEW_640)
-    np.testing.assert_array_equal(placed, sent(Disturbance(view=disturbances.VIEW_640), 1)[0])
+    placed = camera.resample(np.full((480, 640), 2.0, np.float32), NARROW_VIEW)
+    np.testing.assert_array_equal(placed, sent(Disturbance(view=NARROW_VIEW), 1)[0])
 
 
 def test_an_error_changes_nothing_else():
@@ -153,3 +154,20 @@ def test_an_error_changes_nothing_else():
     noisy = sent(bad._replace(noise=0.01), 5)
     for a, b in zip(sent(bad, 5), noisy, strict=True):
         np.testing.assert_array_equal(blind(a), blind(b))
+
+
+def test_a_trials_camera_is_drawn_within_the_ranges_of_training():
+    ranges = Randomisation(
+        depth_noise=0.01, depth_scale=0.03, depth_dead=0.1, depth_holes=0.2, narrow_view=0.5
+    )
+    draw = lambda ranges, k: disturbances.sample_disturbance(ranges, 2, np.random.default_rng(k))
+    drawn = [draw(ranges, k) for k in range(400)]
+    for name, low, high in (
+        ("noise", 0.0, 0.01), ("scale", 0.97, 1.03), ("dead", 0.0, 0.1), ("invalid", 0.0, 0.2),
+    ):  # fmt: skip
+        values = np.array([getattr(d, name) for d in drawn])
+        assert low <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high
+    assert 150 < sum(d.view == NARROW_VIEW for d in drawn) < 250
+    assert {d.latency for d in drawn} == {2} and len({d.seed for d in drawn}) == 400
+    assert draw(Randomisation(), 0)._replace(seed=0) == Disturbance(latency=2)
