@@ -195,7 +195,7 @@ def drive(options: Options) -> None:
 def record(world: World, train: ppo.TrainState | None, options: Options) -> Recording:
     """Simulate one robot until its episode or the time ends."""
     key_start, key_act = jax.random.split(jax.random.key(options.seed))
-    robots = jax.jit(rollout.start, static_argnums=2)(world, key_start, 1)
+    robots = jax.jit(rollout.start)(world, key_start[None])
     robots = robots.replace(env=robots.env.replace(step=jnp.zeros_like(robots.env.step)))
     steps: list[Step] = []
     count = max(1, round(options.seconds / world.config.physics.control_period))
