@@ -29,6 +29,7 @@ def free_port():
 def page():
     port = free_port()
     page = server.open_page(CURBS, port)
+    page._draw(0)  # the robot is there before the thread and a test draw it
     thread = threading.Thread(target=page.run)
     thread.start()
     yield page, port, thread
