@@ -36,7 +36,7 @@ class Ended(NamedTuple):
 
 def begin(*arguments: str, devices: int) -> subprocess.Popen:
     flags = (
-        "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "  # as in conftest.py
+        "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "  # as conftest
         f"--xla_force_host_platform_device_count={devices}"
     )
     return subprocess.Popen(
