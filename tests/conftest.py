@@ -13,8 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # as a deployed policy wants it
 # XLA's threads: a Cholesky of MJX's holds one while others do its work, and two of them would wait
 # for ever on two threads
 os.environ.setdefault("NPROC", "8")
-# Most of the suite's time is compilation: without optimisation and by XLA's older emitters it takes
-# a third as long.
+# Most of the suite's time is compilation; XLA's older emitters take less than half as long.
 os.environ.setdefault(
     "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 )

@@ -316,8 +316,9 @@ def test_a_plugin_that_finds_no_gpu_is_no_silent_run_on_the_cpu(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path):
-    settings = ("--network.variant", "full")  # with a camera; the teacher above is without
+@pytest.mark.parametrize("variant", ["blind", "full"])
+def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, variant: str):
+    settings = ("--network.variant", variant)
     run(tmp_path / "straight", "--iterations", "4", "--run.chunk", "2", *settings)
     run(tmp_path / "halves", "--iterations", "2", *settings)
     run(tmp_path / "halves", "--iterations", "4", "--resume")

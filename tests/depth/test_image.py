@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.ndimage
+from compilation import AS_SHIPPED
 
 from cref_jax import config, depth, robot, terrain
 from cref_jax.robot import kinematics
@@ -22,8 +23,6 @@ DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # image
 LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # looks along +x
 MIDDLE = (HEIGHT // 2, WIDTH // 2)  # the pixel right of and below the optical axis
 
-# its rounding is what is measured here
-AS_SHIPPED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
 render = functools.partial(depth.render, camera=CAMERA)
 draw = jax.jit(render, compiler_options=AS_SHIPPED)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilation import AS_SHIPPED
 from small_world import ROBOTS, C, assert_equal, one, put
 
 from cref_jax import config
@@ -17,7 +18,6 @@ from cref_jax.env import environment, footholds, gait, observations, rewards
 from cref_jax.physics.simulation import Physics
 
 LENGTH = C.terrain.lane_length
-AS_SHIPPED = {"xla_cpu_use_fusion_emitters": True}  # its rounding is what is measured here
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilation import AS_SHIPPED
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,8 +20,6 @@ C = robot.fill_in(config.Config()).foothold
 X = 0.12 + 0.04 * np.arange(25)  # m, means of the windows: 24 cm from 0 on, every 4 cm
 ACROSS = 0.007  # m, y of the soles: no point of the buffer lies on the border of two columns
 
-# its rounding is what is measured here
-AS_SHIPPED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
 windows = jax.jit(
     lambda z, c=C: footholds.windows(z, c), static_argnums=1, compiler_options=AS_SHIPPED
 )

@@ -35,10 +35,7 @@ class Ended(NamedTuple):
 
 
 def begin(*arguments: str, devices: int) -> subprocess.Popen:
-    flags = (
-        "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "  # as conftest
-        f"--xla_force_host_platform_device_count={devices}"
-    )
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     return subprocess.Popen(
         [sys.executable, "-m", "cref_jax.train", *arguments],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
