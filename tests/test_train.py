@@ -1,6 +1,7 @@
 """The command line of training: what it refuses, what it writes, and that it resumes exactly."""
 
 import contextlib
+import functools
 import json
 import shutil
 import signal
@@ -13,6 +14,7 @@ from types import ModuleType
 import jax
 import numpy as np
 import pytest
+from compilation import AS_SHIPPED
 from small_world import assert_equal
 
 from cref_jax import config, export, train
@@ -317,7 +319,12 @@ def test_a_plugin_that_finds_no_gpu_is_no_silent_run_on_the_cpu(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["blind", "full"])
-def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(tmp_path: Path, variant: str):
+def test_a_run_resumed_is_the_run_uninterrupted_bit_for_bit(
+    tmp_path: Path, variant: str, monkeypatch: pytest.MonkeyPatch
+):
+    # The older emitters round a call of two iterations unlike two calls of one.
+    as_shipped = functools.partialmethod(jax.stages.Lowered.compile, AS_SHIPPED)
+    monkeypatch.setattr(jax.stages.Lowered, "compile", as_shipped)
     settings = ("--network.variant", variant)
     run(tmp_path / "straight", "--iterations", "4", "--run.chunk", "2", *settings)
     run(tmp_path / "halves", "--iterations", "2", *settings)
