@@ -13,30 +13,30 @@
 set -euo pipefail
 
 here=$(cd "$(dirname "$0")" && pwd)
-PACKAGES="brax cloudpickle docstring_parser flax glfw imageio-ffmpeg jaxopt jaxtyping loky ml_collections mujoco
-  mujoco-core mujoco-mjx optax orbax-checkpoint tensorboardX trimesh typeguard tyro warp-lang"
+WITH_JAX="jax jaxlib ml_dtypes numpy opt_einsum scipy" # that machine has these
 
 fail() { echo "error: $*" >&2; exit 2; }
 
 pack() {
-  local folder=${1:?pack needs a folder} python=3.12 root wanted=() version
+  local folder=${1:?pack needs a folder} python=3.12 root
   shift
   [ "${1:-}" = "--python" ] && { python=${2:?--python needs a version}; shift 2; }
   root=$(cd "$here/.." && pwd)
+  local tested="$root/constraints/py${python/./}.txt"
+  [ -f "$tested" ] || fail "Python $python is not tested; 3.11 and 3.12 are"
+  [ -z "$(find "$folder" -maxdepth 1 -name '*.whl' 2>/dev/null)" ] ||
+    fail "$folder holds wheels; name a new folder"
   local pip="$root/.venv/bin/python -m pip --disable-pip-version-check"
   [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
   [ "${1:-}" != "--" ] || $root/.venv/bin/python -c "import warp" 2>/dev/null ||
     fail "kernels are compiled by MuJoCo Warp, which is not here: pip install 'cref-jax[warp]'"
-  for name in $PACKAGES; do
-    version=$({ $pip show "$name" 2>/dev/null || true; } | awk '/^Version:/ { print $2 }')
-    : "${version:=$(sed -n "s/^$name==//p" "$root/constraints/py${python/./}.txt" 2>/dev/null)}"
-    wanted+=("$name${version:+==$version}")
-  done
   mkdir -p "$folder"
   $pip wheel --quiet --no-deps --wheel-dir "$folder" "$root"
-  $pip download --quiet --no-deps --only-binary=:all: --python-version "$python" \
-    --implementation cp --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
-    --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 --dest "$folder" "${wanted[@]}"
+  $pip download --quiet --only-binary=:all: --python-version "$python" --implementation cp \
+    --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
+    --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 --dest "$folder" \
+    --constraint "$tested" "$(echo "$folder"/cref_jax-*.whl)[warp]"
+  for name in $WITH_JAX; do rm -f "$folder/$name"-*.whl; done
   cp "$here/gpu_run.sh" "$folder/"
   if [ "${1:-}" = "--" ]; then
     shift

@@ -21,6 +21,7 @@ SCRIPT = Path(__file__).parents[2] / "experiments" / "gpu_run.sh"
         ),
         (["run"], "run needs a folder to write to"),
         (["pack"], "pack needs a folder"),
+        (["pack", "new", "--python", "3.9"], "error: Python 3.9 is not tested; 3.11 and 3.12 are"),
     ],
 )
 def test_a_mistake_is_told_before_anything_is_done(arguments, says, tmp_path):
