@@ -1,6 +1,7 @@
 """The command line of training: what it refuses, what it writes, and that it resumes exactly."""
 
 import contextlib
+import dataclasses
 import functools
 import json
 import shutil
@@ -351,6 +352,13 @@ def test_a_run_begins_as_a_policy_whose_critic_is_gone(first: Path, tmp_path: Pa
     assert int(seen.count) == 576
     drift = np.abs(seen.mean - policy.train.statistics.obs.mean)
     assert np.all(drift < 2.0 * np.asarray(seen.std) + 1e-3)
+
+
+def test_a_run_with_a_readout_is_loaded_where_none_is_trained(first: Path):
+    c = run_dir.read_config(first)
+    assert c.ppo.readout_weight > 0.0
+    without = dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, readout_weight=0.0))
+    assert trained.load_policy(first, build_world(without)).train.params.readout is not None
 
 
 @pytest.mark.slow

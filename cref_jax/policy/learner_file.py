@@ -13,8 +13,8 @@ import numpy as np
 from cref_jax.config import Config, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.policy.trained import TrainedPolicy
-from cref_jax.training import iteration, pytree_digest
+from cref_jax.policy.trained import TrainedPolicy, learner_shapes
+from cref_jax.training import pytree_digest
 
 _SETTINGS, _ITERATION = "settings", "iterations"  # not the name of any leaf
 
@@ -71,7 +71,7 @@ def read(path: Path, world: World) -> TrainedPolicy:
         ConfigError: it is not a learner file, or its network differs.
     """
     arrays, c = _load_arrays(path), read_config(path)
-    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
+    like = learner_shapes(c, world)
     for name, leaf in pytree_digest.by_path(like).items():
         if name not in arrays or arrays[name].shape != leaf.shape:
             raise ConfigError(f"{path} does not fit these settings: {name} is not {leaf.shape}")

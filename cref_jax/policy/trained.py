@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 
 from cref_jax import ppo
-from cref_jax.config import Config
+from cref_jax.config import Config, override
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.training import distillation, iteration, run_dir
@@ -46,8 +46,8 @@ def load_policy(run: Path, world: World) -> TrainedPolicy:
         ConfigError: the run does not exist, or trains the teacher of its policy still.
         CheckpointError: it has no readable checkpoint.
     """
-    like = jax.eval_shape(lambda w: iteration.initial_state(w).train, world)
     c = run_dir.read_config(run)
+    like = learner_shapes(c, world)
     with run_dir.checkpoints(run) as steps:
         newest = steps.latest()
         stages = distillation.samples_by_stage(c, newest or 0)
@@ -59,6 +59,16 @@ def load_policy(run: Path, world: World) -> TrainedPolicy:
             )
         train = steps.restore_part("train", like, newest)
         return TrainedPolicy(c, with_averaged_actor(train), newest or 0, run)
+
+
+def learner_shapes(c: Config, world: World) -> ppo.TrainState:
+    """Describe what a run with the settings `c` has learned: its shapes and dtypes.
+
+    Only the network is the world's, since another network's parameters are of no use in it.
+    """
+    readout = {"ppo": {"readout_weight": c.ppo.readout_weight}}
+    as_trained = world.replace(config=override(world.config, readout))
+    return jax.eval_shape(lambda w: iteration.initial_state(w).train, as_trained)
 
 
 def with_averaged_actor(train: ppo.TrainState) -> ppo.TrainState:

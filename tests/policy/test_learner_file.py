@@ -39,6 +39,15 @@ def test_everything_comes_back(small, tmp_path):
     assert sources.read_config(path) == small.config and not sources.is_run(path)
 
 
+def test_a_readout_comes_back_where_none_is_trained(small, tmp_path):
+    read_out = config.override(small.config, {"ppo": {"readout_weight": 0.5}})
+    policy = learned(small.replace(config=read_out), tmp_path / "learned.npz")
+    assert policy.train.params.readout is not None and not small.config.ppo.readout_weight
+    learner_file.write(policy, policy.run)
+    back = sources.load(policy.run, small)
+    jax.tree.map(np.testing.assert_array_equal, back.train, policy.train)
+
+
 def test_a_policy_is_summarized_as_it_is_described(small, tmp_path):
     policy = learned(small, tmp_path / "learned.npz")
     learner_file.write(policy, policy.run)
