@@ -75,13 +75,15 @@ def observe(world: World, state: EnvState, key: PRNGKeyArray) -> Observation:
     )
     ground, qpos = _ground(world, state), state.body.qpos
     scan = observations.height_scan(ground, qpos, c.scan)
-    taught = c.network.variant in config.HPL
+    heights = None
+    if c.network.variant in config.HPL:
+        heights = observations.teacher_heights(ground, qpos, state.support_z, c.scan)
     hidden = _hidden_state(world, state) if c.network.critic_sees == "all" else jnp.zeros(0)
     return Observation(
         proprioception=see(sensed),
         privileged=observations.privileged_state(see(clean), clean.velocity, hidden, scan),
         velocity=clean.velocity,
-        heights=observations.teacher_heights(ground, qpos, c.scan) if taught else None,
+        heights=heights,
     )
 
 

@@ -28,7 +28,7 @@ class Observation(NamedTuple):
     proprioception: Float[Array, " O"]  # o^p_t, Eq. 2
     privileged: Float[Array, " S"]  # s_t, Eq. 3
     velocity: Float[Array, "3"]  # m/s, the velocity estimator's target
-    heights: Float[Array, " G"] | None = None  # m, of the base above the ground; a teacher's alone
+    heights: Float[Array, " G"] | None = None  # m, above the last support; a teacher's alone
 
 
 class Part(NamedTuple):
@@ -132,11 +132,16 @@ def fine_row(
 
 
 def teacher_heights(
-    ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
+    ground: terrain.Terrain, qpos: Float[Array, " Q"], support_z: Float[Array, ""], c: config.Scan
 ) -> Float[Array, " G"]:
-    """Compute the same on the wider grid of a privileged teacher, row by row from behind."""
+    """Compute the ground's height above the last support, m, on the grid of a privileged teacher.
+
+    Row by row from behind. Not below the base: on level ground that says how high the base is, and
+    a teacher that has learned to balance by it falls where the ground first ends.
+    """
     x, y = np.meshgrid(np.linspace(*c.teacher_x), np.linspace(*c.teacher_y), indexing="ij")
-    return _clearance(ground, qpos, x.ravel(), y.ravel(), c)
+    height = _heights_around(ground, qpos, x.ravel(), y.ravel())
+    return jnp.clip(height - support_z, -c.clip, c.clip)
 
 
 def _clearance(
@@ -146,10 +151,19 @@ def _clearance(
     y: Float[np.ndarray, " N"],
     c: config.Scan,
 ) -> Float[Array, " N"]:
+    clearance = qpos[2] - _heights_around(ground, qpos, x, y)
+    return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
+
+
+def _heights_around(
+    ground: terrain.Terrain,
+    qpos: Float[Array, " Q"],
+    x: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, " N"],
+) -> Float[Array, " N"]:
     grid = (x.astype(np.float32), y.astype(np.float32))
     by_x, by_y = geometry.rotate_yaw_xy(geometry.yaw(qpos[3:7]), *grid)
-    clearance = qpos[2] - terrain.height_under(ground, qpos[0] + by_x, qpos[1] + by_y)
-    return jnp.clip(clearance - c.base_height, -c.clip, c.clip)
+    return terrain.height_under(ground, qpos[0] + by_x, qpos[1] + by_y)
 
 
 def privileged_state(

@@ -18,7 +18,6 @@ from cref_jax.network.records import Carry, DepthInput, EncodedInput, Features, 
 
 _HEIGHT_MLP = (128, 64)  # hidden widths; the latent after them is as wide as C_psi(D), 32
 DEPTH_MLP = (128,)  # hidden width after the filters; the latent is as wide as the teacher's
-_HEIGHT_SCALE = 5.0  # 1/m; legged_gym's, so that steps of 20 cm are near 1
 
 
 class PooledFilter(nn.Module):
@@ -70,7 +69,8 @@ class ParkourActor(nn.Module):
         if c.variant == "hpl":
             self.depth_encoder = DepthEncoder(c)
         else:
-            self.height_encoder = MLP((*_HEIGHT_MLP, c.compressed))
+            # the robot walks on when it first sees an edge, and learns from what comes of it
+            self.height_encoder = MLP((*_HEIGHT_MLP, c.compressed), scale=HEAD_SCALE)
         self.gru = GRU(c.gru)
         self.action_head = MLP((*c.actor, self.num_actions), scale=HEAD_SCALE)
         std = nn.initializers.constant(math.log(c.initial_std))
@@ -89,8 +89,8 @@ class ParkourActor(nn.Module):
             carry: the memory before the first step.
             obs: o^p, normalised (Eq. 2).
             begins: the step is the first of an episode; the memory is cleared before it.
-            sight: a student's frames, each encoded once; a teacher's heights of the base above the
-                ground, m.
+            sight: a student's frames, each encoded once; a teacher's heights of the ground above
+                the last support, m.
         """
         if isinstance(sight, DepthInput):
             encoded = self.encode(sight.frames)
@@ -116,7 +116,7 @@ class ParkourActor(nn.Module):
             latent = repeat_frames(view.features.compressed, view.holding)
             latent = jnp.where(view.seen[..., None], latent, 0.0)
         else:
-            latent = self.height_encoder(_HEIGHT_SCALE * view)
+            latent = self.height_encoder(view)
         gru, h = self.gru(carry.gru, jnp.concatenate([obs, latent], axis=-1), begins)
         log_std = floor_log_std(self.log_std, self.c.min_std)
         velocity = jnp.zeros((*h.shape[:2], 3))

@@ -124,19 +124,22 @@ def test_the_fine_row_places_a_riser_within_its_spacing():
 
 def test_a_teacher_sees_which_cells_around_it_are_on_a_step():
     # the same step and base, 0.7 m ahead of it: of 21 rows from -0.5 m on every 10 cm, those from
-    # 0.7 m on, the last 9, in all 11 columns. 0.62 m up and 0.62 m taken off: 0, and -0.2 m there
+    # 0.7 m on, the last 9, in all 11 columns. It stands on 0.05 m: -0.05 m, and 0.15 m there
     heights = np.where((np.arange(200) + 0.5) * 0.02 > 0.99, 0.2, 0.0)[:, None]
     ground = terrain.from_heights(heights, 0.02, (0.0, 0.0))
     qpos = jnp.zeros(19).at[:4].set(jnp.array([0.3, 0.0, 0.62, 1.0]))
-    found = observations.teacher_heights(ground, qpos, SCAN()).reshape(21, 11)
-    np.testing.assert_allclose(found[:12], 0.0, atol=1e-6)
-    np.testing.assert_allclose(found[12:], -0.2, atol=1e-6)
+    found = observations.teacher_heights(ground, qpos, jnp.float32(0.05), SCAN()).reshape(21, 11)
+    np.testing.assert_allclose(found[:12], -0.05, atol=1e-6)
+    np.testing.assert_allclose(found[12:], 0.15, atol=1e-6)
+    # it does not tell how high the base is
+    crouching = observations.teacher_heights(ground, qpos.at[2].set(0.4), jnp.float32(0.05), SCAN())
+    np.testing.assert_array_equal(crouching.reshape(21, 11), found)
     # at x = 0.83 and turned to the left the step is on the right, from 0.17 m on: columns from
     # -0.5 m on every 10 cm, so the first 4
     left = turned([0.0, 0.0, 1.0], 90.0)
     qpos = qpos.at[0].set(0.83).at[3:7].set(left)
-    found = observations.teacher_heights(ground, qpos, SCAN()).reshape(21, 11)
-    np.testing.assert_allclose(found[:, :4], -0.2, atol=1e-6)
+    found = observations.teacher_heights(ground, qpos, jnp.float32(0.0), SCAN()).reshape(21, 11)
+    np.testing.assert_allclose(found[:, :4], 0.2, atol=1e-6)
     np.testing.assert_allclose(found[:, 4:], 0.0, atol=1e-6)
 
 

@@ -77,12 +77,14 @@ def lesson_of(teacher, key, sees: bool) -> distillation.Lesson:
 
 @functools.cache
 def untaught() -> ppo.TrainState:
-    """Return a student before its first lesson, and a teacher whose actions are not near 0."""
+    """Return a student before its first lesson, and a teacher who acts on what it sees."""
     key = jax.random.key(0)
     carry, obs = network.initial_carry(C.network, E), jnp.zeros((T, E, OBS))
     teacher = jax.jit(TEACHER.init)(key, carry, obs, NEVER, jnp.zeros((T, E, 6)))
-    last = teacher["params"]["action_head"]["layer_1"]
-    last["kernel"] = 100.0 * last["kernel"]
+    # both are near 0 at the start of a training
+    for part, layer, times in [("action_head", 1, 100.0), ("height_encoder", 2, 500.0)]:
+        last = teacher["params"][part][f"layer_{layer}"]
+        last["kernel"] = times * last["kernel"]
     blank = lesson_of(teacher, key, True)
     actor = jax.jit(STUDENT.init)(key, carry, obs, NEVER, blank.sight)
     train = ppo.initial_state(ppo.Params(actor, {}), OBS, 1, C.ppo)
