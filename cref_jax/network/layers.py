@@ -113,7 +113,7 @@ class PatchFilter(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "patches I"]) -> Float[Array, "groups gO"]:
         """Filter the patches."""
-        kernel, bias = _Filter(self.channels, name="filter")(x.shape[-1])
+        kernel, bias = DenseParameters(self.channels, name="filter")(x.shape[-1])
         # a product, not a tile: XLA would gather each element of the bias by index, and such a loop
         # does not vectorise
         again = np.tile(np.eye(self.channels, dtype=np.float32), self.group)
@@ -121,7 +121,7 @@ class PatchFilter(nn.Module):
         return product(x, kernel).reshape(-1, self.group * self.channels) + bias
 
 
-class _Filter(nn.Module):
+class DenseParameters(nn.Module):
     """The parameters of a dense layer."""
 
     features: int
