@@ -234,10 +234,13 @@ def _run_stages(
         return _run_stage(world, mesh, steps, report, options)
     taught = world.replace(config=distillation.teacher_config(world.config))
     last = taught.config.run.iterations
-    if (steps.latest() or 0) > last:
+    done, stop = steps.latest() or 0, StopRequest()
+    if done > last:
         return _run_stage(world, mesh, steps, report, options)
-    stop = StopRequest()
-    state = _run_stage(taught, mesh, steps, report, options, stop)
+    if done == last:
+        state = _first_state(taught, mesh, steps, options)
+    else:
+        state = _run_stage(taught, mesh, steps, report, options, stop)
     if stop.requested or int(state.train.iteration) < last:
         return state
     report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")

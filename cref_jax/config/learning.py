@@ -63,7 +63,7 @@ class PPO:
 class Distillation:
     """How a student of variant hpl learns, in a run whose first iterations are its teacher's."""
 
-    teacher_iterations: int = 0  # in which PPO trains the teacher; 0: seven tenths of the run's
+    teacher_iterations: int = 0  # in which PPO trains the teacher; 0: nine tenths of the run's
     learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
 
 

@@ -169,7 +169,8 @@ def _variant_body(variants: Sequence[Record]) -> Html:
     text = (
         "All have the same reward, but for the two ablations of the reward (foot_contact_quality, "
         "no_foothold_reward), and the same optimiser, terrain, seeds and samples. Those of hpl "
-        "include its teacher's, whose parameters are not counted."
+        "include its teacher's, whose parameters are not counted. Where the others learn to read "
+        "out the ground (ppo.readout_weight, on a CPU), its teacher, who is given it, does not."
     )
     return join(paragraph(text), markup.table(columns, rows))
 

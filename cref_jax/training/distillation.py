@@ -17,7 +17,7 @@ from cref_jax.env.world import World
 from cref_jax.ppo import reductions
 from cref_jax.training import rollout
 
-_TEACHER_SHARE = 0.7  # of all iterations; assumed: imitation needs fewer samples than PPO
+_TEACHER_SHARE = 0.9  # of all iterations; assumed: imitation needs fewer samples than PPO
 
 
 class Lesson(NamedTuple):

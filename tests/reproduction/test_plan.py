@@ -25,8 +25,8 @@ def test_samples_are_whole_iterations_of_all_robots():
     plan = build()
     assert [plan.configs[v].run.iterations for v in plan.variants] == [3256, 3256]
     assert plan.samples(Row("full", 4)) == 3256 * 6144
-    # seven tenths are the teacher's: 2279.2
-    assert plan.configs["hpl"].distillation.teacher_iterations == 2279
+    # nine tenths are the teacher's: 2930.4
+    assert plan.configs["hpl"].distillation.teacher_iterations == 2930
     # 100 robots: 2,400 samples per iteration
     assert build(num_envs=100).configs["full"].run.iterations == 8334
     # the paper's: 20,000 iterations of 4096 robots
@@ -39,21 +39,21 @@ def test_a_whole_table_with_the_first_seed_comes_first():
     assert names == ["full-seed0", "hpl-seed0", "full-seed4", "hpl-seed4"]
 
 
-def test_variants_differ_in_the_network_or_in_one_weight_of_the_reward_and_in_nothing_else():
+def test_variants_differ_in_the_network_or_in_one_weight_of_the_reward_and_hpl_in_the_readout():
     plan = build(EXPERIMENTS, settings=MORE)
     full = plan.configs["full"]
     own = lambda c: (c.network.variant, c.network.convolutions, c.distillation.teacher_iterations)
     weights = {"foothold_placement", "foot_contact_quality"}
     for name, c in plan.configs.items():
-        reward = full.reward if own(c) == own(full) else c.reward
-        assert own(c) == own(full) or c.reward == full.reward, name
+        reward = c.reward if own(c) == own(full) else full.reward
         network = dataclasses.replace(
             c.network, variant="full", convolutions=full.network.convolutions
         )
-        assert (
-            dataclasses.replace(c, network=network, reward=reward, distillation=full.distillation)
-            == full
-        ), name
+        expected = dataclasses.replace(full, reward=reward, distillation=c.distillation)
+        if name == "hpl":  # its teacher is given the ground, which the readout is there to find
+            without = dataclasses.replace(full.ppo, readout_weight=0.0)
+            expected = dataclasses.replace(expected, ppo=without)
+        assert dataclasses.replace(c, network=network) == expected, name
         mine, theirs = (dataclasses.asdict(x.reward.weights) for x in (c, full))
         assert {key for key in mine if mine[key] != theirs[key]} <= weights
         rest = dataclasses.replace(c.reward, weights=full.reward.weights)

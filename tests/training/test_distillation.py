@@ -52,9 +52,9 @@ def test_the_loss_is_the_sum_over_joints_and_the_mean_over_valid_samples():
     np.testing.assert_allclose(grad, [(-1 + 1 + 1) / 3, (1 + 1 - 1) / 3], atol=1e-6)
 
 
-def test_the_first_stage_has_seven_tenths_of_the_iterations_and_each_its_samples():
+def test_the_first_stage_has_nine_tenths_of_the_iterations_and_each_its_samples():
     c = config.override(C, {"distillation": {"teacher_iterations": 0}})
-    assert distillation.fill_in(c).distillation.teacher_iterations == 7
+    assert distillation.fill_in(c).distillation.teacher_iterations == 9
     first = distillation.teacher_config(C)
     assert (first.network.variant, first.run.iterations) == ("hpl_teacher", 4)
     assert distillation.samples_by_stage(C, 3) == {"teacher": 3 * E * T, "student": 0}
