@@ -26,6 +26,21 @@ def test_a_filter_has_no_padding_and_keeps_the_largest_of_each_block():
         np.testing.assert_allclose(found.ravel(), [expected], rtol=1e-6)
 
 
+@pytest.mark.parametrize(("kernel", "pool"), [(3, 2), (2, 3), (3, 1)])
+def test_a_filter_is_a_convolution_then_a_largest_of_windows(kernel, pool):
+    image = jax.random.normal(jax.random.key(0), (1, 5, 9, 12, 2))
+    net = PooledFilter(4, kernel, pool)
+    params = net.init(jax.random.key(1), image)["params"]["filter"]
+    params["bias"] = jnp.arange(4.0)
+    weights = params["kernel"].reshape(kernel, kernel, 2, 4)
+    axes = ("NHWC", "HWIO", "NHWC")
+    y = jax.lax.conv_general_dilated(image[0], weights, (1, 1), "VALID", dimension_numbers=axes)
+    window = (1, pool, pool, 1)
+    y = jax.lax.reduce_window(y + params["bias"], -jnp.inf, jax.lax.max, window, window, "VALID")
+    found = net.apply({"params": {"filter": params}}, image)[0]
+    np.testing.assert_allclose(found, jax.nn.elu(y), atol=1e-5)
+
+
 def actor(variant):
     c = config.override(C, {"variant": variant})
     return network.build_actor(c, J), network.initial_carry(c, E)
