@@ -60,6 +60,14 @@ class RunCurves(NamedTuple):
         return self.log["train/samples"] / 1e6 if known else self.log["iteration"]
 
 
+class LevelCurve(NamedTuple):
+    """The curriculum level of a run on one kind of lane."""
+
+    variant: str
+    millions: Sequence[float]  # samples
+    level: Sequence[float]
+
+
 def sections(
     log: Log, marks: Sequence[int], target_kl: float | None, starts: int
 ) -> Iterator[Section]:
@@ -96,6 +104,21 @@ def latest_values(log: Log) -> Iterator[tuple[str, str]]:
             value = float(training_log.smooth(log, name, of.window)[-1])
             shown = form.format(value) if math.isfinite(value) else markup.MISSING
             yield shown, f"{title}, last {of.window} iterations"
+
+
+def level_chart(title: str, curves: Sequence[LevelCurve]) -> Html:
+    """Draw levels over the samples: a colour per variant, a curve per run."""
+    variants = list(dict.fromkeys(curve.variant for curve in curves))
+
+    def paint(axis: Axes) -> None:
+        for number, variant in enumerate(variants):
+            for k, curve in enumerate(c for c in curves if c.variant == variant):
+                label = variant if k == 0 else None
+                axis.plot(curve.millions, curve.level, lw=1.3, color=f"C{number}", label=label)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        _label_axes(axis, title, ("level",), samples=True)
+
+    return markup.chart(paint, title)
 
 
 def _reading_note(of: RunCurves, starts: int) -> Html:

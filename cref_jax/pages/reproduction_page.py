@@ -8,8 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cref_jax.pages import evaluation_charts, markup
+from cref_jax.pages import evaluation_charts, learning_charts, markup
 from cref_jax.pages.evaluation_charts import SuccessRate
+from cref_jax.pages.learning_charts import LevelCurve
 from cref_jax.pages.markup import MISSING, Column, Html, Section, element, join, note, paragraph
 from cref_jax.terrain import generators
 
@@ -49,6 +50,8 @@ def _sections(record: Record) -> Iterator[Section]:
     gated = [of for of in record["variants"] if of["gate"]]
     if gated:
         yield Section("Highway gate", _gate_body(record, gated))
+    if any(row["curves"] for row in record["rows"]):
+        yield Section("Levels in training", _level_body(record))
     yield Section("Variants", _variant_body(record["variants"]))
     yield Section("Rows", _row_body(record["rows"]))
     yield Section("How it was measured", _method_body(record))
@@ -150,6 +153,35 @@ def _gate_body(record: Record, variants: Sequence[Record]) -> Html:
         markup.table([Column("variant"), *(Column(name, True) for name in names)], gaps),
         markup.collapsible("The mean gate in each state", markup.table(heads, means)),
     )
+
+
+def _level_body(record: Record) -> Html:
+    """Build the curves of the level on each kind of lane, and the table of the last levels."""
+    begun = [row for row in record["rows"] if row["curves"]]
+    kinds = list(dict.fromkeys(kind for row in begun for kind in row["curves"]["levels"]))
+    millions = lambda row: [n / 1e6 for n in row["curves"]["samples"]]
+    plots = [
+        learning_charts.level_chart(
+            f"level, {kind.replace('_', ' ')}",
+            [
+                LevelCurve(row["variant"], millions(row), row["curves"]["levels"][kind])
+                for row in begun
+                if kind in row["curves"]["levels"]
+            ],
+        )
+        for kind in kinds
+    ]
+    done = [of for of in record["variants"] if of["levels"]]
+    rows = [[_title(of), *(_few(of["levels"][kind], 1.0, 1) for kind in kinds)] for of in done]
+    columns = [Column("last level"), *(Column(kind.replace("_", " "), True) for kind in kinds)]
+    text = (
+        "Difficulty of the lanes that the robots have earned, 0 the easiest, while they explore: "
+        "each point is the mean over the robots on that kind of lane and a twentieth of the "
+        "training. Rows that are still trained are drawn, too; hpl's begin with its teacher's "
+        "samples. After few samples every cell of Table II is near 0, and variants differ here."
+    )
+    table = [markup.table(columns, rows)] if done else []
+    return join(_sample_note(record), paragraph(text), markup.charts(*plots), *table)
 
 
 def _variant_body(variants: Sequence[Record]) -> Html:

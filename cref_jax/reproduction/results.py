@@ -12,7 +12,7 @@ from typing import Any
 
 from cref_jax.evaluation import highway_gate, intervals, paper_results, tables
 from cref_jax.evaluation.intervals import Rate
-from cref_jax.reproduction import progress
+from cref_jax.reproduction import levels, progress
 from cref_jax.reproduction.plan import Plan, Row
 
 Record = dict[str, Any]
@@ -30,20 +30,20 @@ COMPARED = (  # states whose difference of gates the paper finds above 0, Sec. I
 
 def build_record(folder: Path, plan: Plan, parameters: Mapping[str, Mapping[str, int]]) -> Record:
     """Build the record of what the folder holds; `parameters` by variant: policy and critic."""
-    rows = [_describe_row(folder, plan, row) for row in plan.rows]
+    learned = {row: levels.read_levels(folder, plan, row) for row in plan.rows}
+    rows = [{**_describe_row(folder, plan, row), "curves": learned[row]} for row in plan.rows]
     evaluated = {
         row: {s: progress.read_evaluation(folder, plan, row, s) for s in progress.suites(plan, row)}
         for row in plan.rows
         if progress.is_finished(folder, plan, row)
     }
+    of = lambda values, variant: {r.seed: values[r] for r in evaluated if r.variant == variant}
     variants = [
-        _summarize_variant(
-            variant,
-            {row.seed: of for row, of in evaluated.items() if row.variant == variant},
-            len(plan.seeds),
-            parameters,
-        )
-        for variant in plan.variants
+        {
+            **_summarize_variant(name, of(evaluated, name), len(plan.seeds), parameters),
+            "levels": _levels(list(of(learned, name).values())),
+        }
+        for name in plan.variants
     ]
     return {
         "terrain": plan.terrain,
@@ -115,6 +115,14 @@ def _summarize_variant(
         "touchdowns": [_touchdowns(variant, of_table, way) for way in ("up", "down")],
         "gate": _gate([of["gate"]["gate"] for of in evaluated.values() if "gate" in of]),
     }
+
+
+def _levels(learned: Sequence[Record | None]) -> Record:
+    """Summarize the last level on each kind of lane."""
+    logged = [of["levels"] for of in learned if of]
+    kinds = dict.fromkeys(kind for of in logged for kind in of)
+    last = {kind: [of[kind][-1] for of in logged if kind in of] for kind in kinds}
+    return {k: over_seeds([x for x in each if x is not None], 0.0) for k, each in last.items()}
 
 
 def _success(variant: str, records: Sequence[Record]) -> Record:

@@ -41,6 +41,8 @@ def test_a_plan_killed_twice_gives_the_same_tables(tmp_path, plan, monkeypatch):
     assert len(straight.log) == 6 * 4 + 2 * (2 + 1 + 2)
     assert straight.log[:6] == [*(f"full-seed0 {k}" for k in range(1, 5)), "full-seed0 table",
                                 "full-seed0 gate"]  # fmt: skip
+    # the last of four levels, each averaged over a twentieth of them: itself
+    assert tables(tmp_path / "straight")[2]["levels"]["gap"]["each"] == [2.11, 2.11]  # blind-seed0
     for step in range(0, len(straight.log) - 1, 3):
         folder = tmp_path / str(step)
         with pytest.raises(Killed):
@@ -68,6 +70,11 @@ def test_an_unfinished_row_has_no_part_in_the_tables_and_is_marked(tmp_path, pla
     full, no_highway, blind = tables(tmp_path)
     assert full["seeds"] == [0] and full["success"]["overall"]["seeds"]["deviation"] is None
     assert no_highway["seeds"] == blind["seeds"] == [] and "success" not in blind
+    rows = json.loads((tmp_path / "reproduction.json").read_text())["rows"]
+    assert rows[0]["curves"] == {
+        "samples": [192, 384, 576, 768], "levels": {"gap": [0.6, 1.1, 1.6, 2.1]},
+    }  # fmt: skip
+    assert no_highway["levels"] == {} and rows[2]["curves"] is None
     page = (tmp_path / "reproduction.html").read_text()
     assert (
         "1 of 6" in page and "full, single run so far" in page and "unfinished: not begun" in page

@@ -15,7 +15,11 @@ def summary(variant="full", lost=(1, 3), mads=(0.03, 0.05), shifts=(0, 10)):
         seed: {"table": table(20, *of), "gate": gate(20, shift)}
         for seed, (*of, shift) in enumerate(zip(lost, mads, shifts, strict=True))
     }
-    return results._summarize_variant(variant, of, 2, SIZES)
+    learned = [{"samples": [8, 16], "levels": {"gap": [0.0, level]}} for level in (2.0, 3.0)]
+    return {
+        **results._summarize_variant(variant, of, 2, SIZES),
+        "levels": results._levels(learned),
+    }
 
 
 def test_a_mean_over_two_seeds_and_its_interval():
@@ -96,7 +100,8 @@ def test_a_variant_whose_size_differs_by_more_than_a_tenth_is_pointed_out():
 
 def test_the_page_shows_the_numbers_beside_the_papers_and_says_how_they_differ(tmp_path):
     row = {"row": "full-seed0", "samples": 4_000_000, "planned": 20_000_000, "finished": False}
-    row |= {"samples_per_s": 6000.0, "training_s": 666.0, "evaluation_s": 0.0}
+    row |= {"samples_per_s": 6000.0, "training_s": 666.0, "evaluation_s": 0.0, "variant": "full"}
+    row["curves"] = {"samples": [8, 4_000_000], "levels": {"gap": [None, 2.0]}}
     record = {
         "terrain": "mixed", "device": "cpu", "seeds": [0, 1], "trials": 20, "settings": [],
         "samples": 20_000_000, "paper_samples": 2_000_000_000, "paper_trials": 2000,
@@ -115,6 +120,8 @@ def test_the_page_shows_the_numbers_beside_the_papers_and_says_how_they_differ(t
     assert tables[2][4:] == ["4.0 cm (3.0, 5.0; 0.0 to 16.7)", "1.4 cm"]
     assert rows["hpl"][2:] == ["88.0 %", "10", "HPL", "differs from full by more than 10 %"]
     assert rows["full-seed0"][1:4] == ["unfinished: being trained", "4.0 M of 20.0 M", "6,000"]
-    # beside each of the four tables of numbers
+    # beside each of the five tables of numbers
     note = "20.0 M samples per run, 1 % of the paper's; the paper has 2 billion (2,000.0 M)"
-    assert seen.text.count(note) == 4
+    assert seen.text.count(note) == 5
+    # levels 2 and 3: standard error 0.5, Student's t 12.706, and no level is below 0
+    assert ["full, 2 seeds", "2.5 (2.0, 3.0; 0.0 to 8.9)"] in seen.rows

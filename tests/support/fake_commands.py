@@ -48,10 +48,10 @@ class FakeRunner(Runner):
         last = int((run / "last").read_text())
         for iteration in range(latest + 1, last + 1):
             self._step(f"{run.name} {iteration}")
+            line = {"iteration": iteration, "samples_per_s": 192 / STEP_S, "level/flat": 9.0}
+            line["level/gap"] = 0.5 * iteration + len(run.name) / 100.0
             with (run / "log.jsonl").open("a") as log:
-                log.write(
-                    json.dumps({"iteration": iteration, "samples_per_s": 192 / STEP_S}) + "\n"
-                )
+                log.write(json.dumps(line) + "\n")
             if iteration % 2 == 0 or self.signal:  # a step in between is lost with the process
                 (run / "checkpoints" / str(iteration) / "state").mkdir(parents=True)
             if self.signal:
