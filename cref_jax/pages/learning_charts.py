@@ -65,7 +65,7 @@ class LevelCurve(NamedTuple):
 
     variant: str
     millions: Sequence[float]  # samples
-    level: Sequence[float]
+    level: Sequence[float | None]  # None where it was not logged
 
 
 def sections(
