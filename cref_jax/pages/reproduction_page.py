@@ -158,7 +158,7 @@ def _gate_body(record: Record, variants: Sequence[Record]) -> Html:
 def _level_body(record: Record) -> Html:
     """Build the curves of the level on each kind of lane, and the table of the last levels."""
     begun = [row for row in record["rows"] if row["curves"]]
-    kinds = list(dict.fromkeys(kind for row in begun for kind in row["curves"]["levels"]))
+    kinds = list(begun[0]["curves"]["levels"])  # all rows have one terrain
     millions = lambda row: [n / 1e6 for n in row["curves"]["samples"]]
     plots = [
         learning_charts.level_chart(
@@ -166,7 +166,6 @@ def _level_body(record: Record) -> Html:
             [
                 LevelCurve(row["variant"], millions(row), row["curves"]["levels"][kind])
                 for row in begun
-                if kind in row["curves"]["levels"]
             ],
         )
         for kind in kinds

@@ -21,7 +21,7 @@ WITHOUT_SIZE = ("flat",)  # kinds whose lanes are all alike
 def read_levels(folder: Path, plan: Plan, row: Row) -> dict[str, Any] | None:
     """Read a row's levels over its samples; None before it has logged any.
 
-    Each is the mean over the robots on lanes of the kind and over the iterations before.
+    Each is the mean over the robots on lanes of the kind and over `SHARE` of the iterations.
     """
     try:
         log = training_log.read(folder / row.name / "log.jsonl")

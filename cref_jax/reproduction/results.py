@@ -120,8 +120,8 @@ def _summarize_variant(
 def _levels(learned: Sequence[Record | None]) -> Record:
     """Summarize the last level on each kind of lane."""
     logged = [of["levels"] for of in learned if of]
-    kinds = dict.fromkeys(kind for of in logged for kind in of)
-    last = {kind: [of[kind][-1] for of in logged if kind in of] for kind in kinds}
+    kinds = list(logged[0]) if logged else []  # all rows have one terrain
+    last = {kind: [of[kind][-1] for of in logged] for kind in kinds}
     return {k: over_seeds([x for x in each if x is not None], 0.0) for k, each in last.items()}
 
 
