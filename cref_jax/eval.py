@@ -28,6 +28,7 @@ from cref_jax.evaluation import (
     crossing,
     failure_films,
     highway_gate,
+    intervals,
     paper_results,
     robustness_suite,
     scene_results,
@@ -52,8 +53,8 @@ class Options(cli.DebugOption):
     """Measure how a trained policy walks."""
 
     run: tuple[Path, ...] = ()
-    """runs/NAME (default: the newest run, or the bundled policy where there is none); with several,
-    such as seeds of one training, the table pools their trials"""
+    """runs/NAME (default: the newest run, or the bundled policy where there is none); of several,
+    such as seeds of one training, the suites table and walk pool the trials"""
     policy: tuple[Path, ...] = ()
     """exported policies instead of runs"""
     robot: str | None = None
@@ -73,7 +74,7 @@ class Options(cli.DebugOption):
     """trials per cell, episodes or robots (default: 100 on a CPU, 2000 on an accelerator; 10 per
     scene)"""
     stress: Annotated[int, Within(0, 1000)] = 2
-    """trials per scene under each condition: lost, late and partly blind frames, friction"""
+    """trials per scene under each condition: bad frames of each kind, a wider view, friction"""
     film: str | None = None
     """film one trial in this scene instead of evaluating in all: SCENE.mp4"""
     films: Annotated[int, Within(0, 20)] = 3
@@ -132,7 +133,7 @@ def _resolve_sources(options: Options) -> list[Path]:
     if options.film and options.suite != "ood":
         raise ConfigError("--film takes a scene of --suite ood; a lane is filmed by cref_jax.play")
     given = [*options.run, *map(sources.find_policy, options.policy)]
-    if len(given) > 1 and options.suite not in (None, "table"):
+    if len(given) > 1 and options.suite not in (None, "table", "walk"):
         raise ConfigError(f"--suite {options.suite} takes one run or policy, not {len(given)}")
     for path in given:
         sources.check_robot(path, options.robot)
@@ -141,7 +142,7 @@ def _resolve_sources(options: Options) -> list[Path]:
 
 def _suite_for(terrains: list[str]) -> Suite:
     """Choose the suite that measures what was learned on these terrains."""
-    return "walk" if terrains == ["flat"] else "table"
+    return "walk" if set(terrains) == {"flat"} else "table"
 
 
 def _subject(source: Path, options: Options) -> Subject:
@@ -238,12 +239,18 @@ def _cross(subjects: list[Subject], options: Options) -> dict[str, Any]:
 
 
 def _walk(subjects: list[Subject], options: Options) -> dict[str, Any]:
-    subject = subjects[0]
-    policy, count = subject.policy, _trials_per_cell(options)
-    physics = subject.world.physics
-    result = walking.walk(policy.config, physics, policy.train, count, options.seed)
-    print(f"{subject.source}, iteration {subject.policy.iteration}: {result.line()}")
-    return result._asdict()
+    """Walk on level ground; the episodes of several policies are pooled."""
+    count, walks = _trials_per_cell(options), []
+    for subject in subjects:
+        policy, physics = subject.policy, subject.world.physics
+        walks.append(walking.walk(policy.config, physics, policy.train, count, options.seed))
+        print(f"{subject.source}, iteration {policy.iteration}: {walks[-1].line()}")
+    pooled = walking.pool(walks)
+    stood = intervals.wilson(pooled.episodes - pooled.fell, pooled.episodes)
+    within = f"without a fall {100 * stood.low:.1f} to {100 * stood.high:.1f} % (95 %)"
+    print(f"together: {pooled.line()}; {within}" if len(walks) > 1 else within)
+    of_each = {"fell_by_policy": [walk.fell for walk in walks]} if len(walks) > 1 else {}
+    return pooled._asdict() | {"wilson_low": stood.low, "wilson_high": stood.high} | of_each
 
 
 def _pictures(witness: Witness, options: Options) -> dict[str, Any]:

@@ -187,7 +187,7 @@ def drive(options: Options) -> None:
     else:
         atlas = _build_lane(dataclasses.replace(c.terrain, name=terrain), options)
         kind = options.kind or atlas.kinds[0]
-        place = Place(kind, float(atlas.sizes[0, atlas.kinds.index(kind)]))
+        place = Place(kind, float(atlas.sizes[0, atlas.kinds.index(kind)]), terrain)
     address = options.host, options.port, options.browser
     server.serve(Settings(source, place, options.seed, options.command, *address))
 

@@ -12,7 +12,7 @@ from cref_jax.errors import ConfigError
 
 
 def build_config(terrain: str, experiment: str | None, device: str) -> Config:
-    """Build the settings of a new run: the paper's, changed by device and experiment.
+    """Build the settings of a new run: the defaults, changed by device and experiment.
 
     Raises:
         ConfigError: an unknown experiment, or a file that cannot be used.

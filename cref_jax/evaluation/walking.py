@@ -1,6 +1,7 @@
 """Episodes on flat ground, each counted until its robot's first end."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -63,6 +64,27 @@ def walk(
     key = jax.random.key(trials.SEED + seed)
     ending, trace = _run_episodes(world, train, key, episodes, steps)
     return _summarize(jax.tree.map(np.asarray, ending), jax.tree.map(np.asarray, trace), c)
+
+
+def pool(walks: Sequence[WalkResult]) -> WalkResult:
+    """Pool the outcomes of policies, each with as many episodes; the gait is the first one's."""
+    total = lambda name: sum(getattr(w, name) for w in walks)
+    average = lambda values: float(np.mean(list(values)))
+    return WalkResult(
+        episodes=total("episodes"),
+        fell=total("fell"),
+        by_cause={cause: sum(w.by_cause[cause] for w in walks) for cause in walks[0].by_cause},
+        speed_error=average(w.speed_error for w in walks),
+        tracking_error=average(w.tracking_error for w in walks),
+        airborne=(average(w.airborne[0] for w in walks), average(w.airborne[1] for w in walks)),
+        step_seconds=average(w.step_seconds for w in walks),
+        sideways={
+            "drift_m": average(w.sideways["drift_m"] for w in walks),
+            "largest_m": average(w.sideways["largest_m"] for w in walks),
+            "worst_m": max(w.sideways["worst_m"] for w in walks),
+        },
+        gait=walks[0].gait,
+    )
 
 
 @jax.jit(static_argnames=("episodes", "steps"))

@@ -35,6 +35,7 @@ class ChoicePanel:
         self._server, self._gui, self._session, self._builder = server, server.gui, session, builder
         self._on_changed, self._lock = on_changed, threading.Lock()
         stage = session.view().stage
+        self._terrain = stage.place.terrain
         with self._gui.add_folder("Ground"):
             self._add_grounds(stage.place)
         with self._gui.add_folder("Policy"):
@@ -116,7 +117,7 @@ class ChoicePanel:
         elif kind == MAP:
             place = Place(map=Path(self._map.value.strip()))
         else:
-            place = Place(kind, size)
+            place = Place(kind, size, self._terrain)
         self.change(lambda stage: self._builder.build(stage.policy, place), "building the ground")
 
     def _take(self, source: str) -> None:

@@ -1,5 +1,6 @@
 """The ground to walk on, the robot on it and its starts: those of `sim2sim` and the scene suite."""
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ class Place:
 
     kind: str = "flat"
     size: float = 0.0  # m; for a slope its gradient
+    terrain: str = "flat"  # whose shape a lane has, where it defines the kind
     map: Path | None = None
     scene: str | None = None
 
@@ -90,7 +92,8 @@ class StageBuilder:
             if place.kind not in generators.KINDS:
                 known = ", ".join(generators.KINDS)
                 raise ConfigError(f"there is no kind of lane '{place.kind}'; take {known}")
-            atlas = lanes.build_grid(c.terrain, {place.kind: (place.size,)}, protocol.LANE_SEEDS)
+            terrain = dataclasses.replace(c.terrain, name=place.terrain)
+            atlas = lanes.build_grid(terrain, {place.kind: (place.size,)}, protocol.LANE_SEEDS)
             turns = len(protocol.LANE_SEEDS)
         world = world.replace(lanes=atlas)
         numbers = np.arange(STARTS) * turns

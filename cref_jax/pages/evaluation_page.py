@@ -32,6 +32,7 @@ PLAIN = {  # record key of the suites walk and cross: (label, unit)
     "size_m": ("obstacle size", " m"),
     "episodes": ("episodes", ""),
     "fell": ("episodes with a fall", ""),
+    "fell_by_policy": ("of them, by policy", ""),
     "trials": ("trials", ""),
     "successes": ("trials that reached the end of the lane", ""),
     "speed_error": ("mean forward speed error", " m/s"),
@@ -131,7 +132,8 @@ def _make_tiles(record: Record) -> Iterator[tuple[str, str]]:
         yield f"{record['passed']} of {len(scenes)}", "scenes passed"
     if record.get("suite") == "walk":
         stood = record["episodes"] - record["fell"]
-        yield f"{stood} of {record['episodes']}", "episodes without a fall"
+        note = f" (95 % interval {_interval(record)})" if "wilson_low" in record else ""
+        yield f"{stood} of {record['episodes']}", "episodes without a fall" + note
     if record.get("suite") == "commands":
         stand, stop = record["commands"][0], record["stop"]
         yield f"{stand['stood']} of {stand['trials']}", "commanded to stand, move less than 5 cm"

@@ -88,9 +88,9 @@ def settings_body(settings: Settings) -> Html:
     rows = [(code(name), shown(current, name), shown(defaults, name)) for name in changed]
     everything = [(code(name), json.dumps(value)) for name, value in current.items()]
     return join(
-        paragraph("These settings differ from the defaults (the paper's values).")
+        paragraph("These settings differ from the defaults.")
         if changed
-        else paragraph("All settings have their defaults (the paper's values)."),
+        else paragraph("All settings have their defaults."),
         markup.table(columns, rows) if changed else Html(),
         markup.collapsible(f"All {len(current)} settings", markup.table(columns[:2], everything)),
     )

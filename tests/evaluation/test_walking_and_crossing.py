@@ -53,6 +53,22 @@ def test_what_comes_after_a_fall_does_not_count():
     assert walk.sideways == pytest.approx({"drift_m": 0.2, "largest_m": 0.2, "worst_m": 0.3})
 
 
+def test_pooled_episodes_add_up_and_pooled_figures_are_means():
+    feet = np.zeros((4, 2, 2), bool)
+    feet[:2, :, 0] = True  # the left foot is up half of the time
+    alive = np.ones((4, 2), bool)
+    one = _summarize(ending(2, low=[True, False]), trace(alive, 0.1, feet), Config())
+    two = _summarize(ending(2, low=[True, True]), trace(alive, 0.3, ~feet), Config())
+    wide = two._replace(sideways=two.sideways | {"worst_m": 0.9})
+    both = walking.pool([one, wide])
+    assert (both.episodes, both.fell, both.by_cause["low"]) == (4, 3, 3)
+    assert both.speed_error == both.tracking_error == pytest.approx(0.2)
+    assert both.airborne == pytest.approx((0.5, 0.5))  # left 0.5, 0.5; right 0, 1
+    assert both.step_seconds == pytest.approx((one.step_seconds + two.step_seconds) / 2)
+    assert both.sideways["worst_m"] == 0.9 and both.sideways["drift_m"] == pytest.approx(0.3)
+    assert walking.pool([one]) == one
+
+
 def test_speed_that_errs_both_ways_alike_is_right_on_the_whole():
     alive = np.ones((4, 1), bool)
     seen = trace(alive, 0.0, np.zeros((4, 1, 2), bool))

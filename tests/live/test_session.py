@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from cref_jax.config import folders
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, protocol, scene_suite, whole_robot
 from cref_jax.evaluation.scene_results import Condition
@@ -57,6 +58,15 @@ def test_a_scene_begins_as_the_scene_suite_does():
     for number in range(2):
         theirs = runner.trial(scene_suite._Job("curbs", number, Condition("good")))
         np.testing.assert_array_equal(theirs.qpos[0, :7], CURBS.starts[number].base)
+
+
+def test_a_lane_has_the_shape_of_its_terrain(tmp_path):
+    file = tmp_path / "shallow.toml"
+    gap = (folders.data_folder("terrains") / "gap.toml").read_text()
+    file.write_text(gap.replace("depth = 1.0", "depth = 0.25"))
+    depth = lambda place: StageBuilder(seed=0).build(ROBUST, place).ground.heights.min()
+    assert depth(Place("gap", 0.3, str(file))) == pytest.approx(-0.25)
+    assert depth(Place("gap", 0.3)) == pytest.approx(-1.0)
 
 
 @pytest.mark.slow

@@ -158,6 +158,9 @@ def test_the_records_of_one_kind_are_shown(tmp_path):
     walk = written(eval_records.WALK, tmp_path).text
     assert "197 of 200episodes without a fall" in walk and "0.0936 m/s" in walk
     assert "0.343, 0.312" in walk and "pelvis too low1" in walk
+    pooled = {"wilson_low": 0.957, "wilson_high": 0.995, "fell_by_policy": [0, 3]}
+    walk = written(eval_records.WALK | pooled, tmp_path).text
+    assert "a fall (95 % interval 95.7 to 99.5 %)" in walk and "of them, by policy0, 3" in walk
     cross = written(eval_records.CROSS | {"seconds": float("nan")}, tmp_path).text
     assert "Crossing obstacles: gap, 30 cm" in cross and "95.5 %of 200 trials" in cross
 
