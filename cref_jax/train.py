@@ -9,7 +9,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -49,8 +49,6 @@ PROGRAM = "python -m cref_jax.train"
 CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
 NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings
 
-Device = Literal["auto", "cpu", "gpu"]
-
 
 @dataclass(frozen=True)
 class Options(cli.DebugOption):
@@ -73,7 +71,7 @@ class Options(cli.DebugOption):
     """short for --run.seed"""
     engine: EngineName = "auto"
     """mujoco steps on the CPU, mjx and warp on the device"""
-    device: Device = "auto"
+    device: devices.Device = "auto"
     """where the program runs; gpu is an error without one"""
     devices: int | None = None
     """devices to shard the environments over (default: all; one per CPU core)"""
@@ -139,7 +137,7 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         ConfigError: a value that cannot be used, an unknown terrain or experiment.
     """
     options = _options(arguments)
-    options = dataclasses.replace(options, device=select_device(options.device))
+    options = dataclasses.replace(options, device=devices.select_device(options.device))
     resumed = (options.run_dir or run_dir.newest()) if options.resume else None
     if resumed:
         base = fill_in(run_dir.read_config(resumed))
@@ -150,6 +148,9 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
         base = presets.build_config(options.terrain, options.experiment, options.device)
     default = Command(options, base)
     command = tyro.cli(Command, args=arguments, default=default, prog=PROGRAM)
+    if not resumed and command.settings.terrain.name != base.terrain.name:
+        name = command.settings.terrain.name
+        raise ConfigError(f"--terrain.name: say --terrain {name}, whose preset comes with it")
     init = command.options.init and sources.find_policy(command.options.init)
     options = dataclasses.replace(command.options, device=options.device, init=init)
     c = fill_in(_with_short_options(command.settings, options), options.robot)
@@ -171,29 +172,6 @@ def _options(arguments: list[str]) -> Options:
     return options
 
 
-def select_device(device: Device) -> Literal["cpu", "gpu"]:
-    """Choose where the program runs, before JAX is used for the first time.
-
-    Raises:
-        ConfigError: a GPU is asked for, or its plugin installed, and JAX has none.
-    """
-    if device == "cpu":
-        jax.config.update("jax_platforms", "cpu")
-    is_chosen = jax.config.jax_platforms == "cpu"  # here, or by JAX_PLATFORMS
-    backend = jax.default_backend()
-    if backend != "gpu" and not is_chosen and jax_setup.has_cuda_plugin():
-        raise ConfigError(
-            "JAX's CUDA plugin is installed and finds no GPU: see whether nvidia-smi does, and "
-            "whether its driver is 525 or newer (cuda12), 580 (cuda13); --device cpu trains without"
-        )
-    if device == "gpu" and backend != "gpu":
-        raise ConfigError(
-            "--device gpu: JAX has no GPU here; install its plugin with: "
-            "pip install 'cref-jax[cuda12]' (driver 525 or newer) or 'cref-jax[cuda13]' (580)"
-        )
-    return "cpu" if backend == "cpu" else "gpu"
-
-
 def train(options: Options, c: Config) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
     if options.wandb:
@@ -209,7 +187,7 @@ def train(options: Options, c: Config) -> None:
     with lock(run) if processes.is_first() else contextlib.nullcontext():
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
-            lines = _opening_lines(run, c, options, first)
+            lines = _opening_lines(run, c, mesh.size, options, first)
             with _open_reporter(run, c, first, options) as report:
                 for line in lines:
                     report.say(line)
@@ -244,8 +222,7 @@ def _run_stages(
     if stop.requested or int(state.train.iteration) < last:
         return state
     report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")
-    folder = options.run_dir if options.profile else None
-    programs = profiled.build_programs(world, mesh, report, folder)
+    programs = _compile(world, mesh, report, options, last)
     state = iteration.start_student(world, state, mesh)
     return trainer.run_chunks(world, state, steps, report, programs)
 
@@ -259,13 +236,20 @@ def _run_stage(
     stop: StopRequest | None = None,
 ) -> iteration.RunState:
     """Train from the first state, or from the newest checkpoint, to the last iteration."""
-    c, first = world.config, steps.latest() or 0
-    folder = options.run_dir if options.profile else None
-    programs = profiled.build_programs(world, mesh, report, folder)
-    if first < c.run.iterations:
-        programs.get(min(c.run.chunk, c.run.iterations - first))
+    programs = _compile(world, mesh, report, options, steps.latest() or 0)
     state = _first_state(world, mesh, steps, options)
     return trainer.run_chunks(world, state, steps, report, programs, stop)
+
+
+def _compile(
+    world: World, mesh: Mesh, report: Reporter | SilentReporter, options: Options, first: int
+) -> trainer.Programs:
+    """Compile the program of the first chunk after `first` iterations."""
+    run, folder = world.config.run, options.run_dir if options.profile else None
+    programs = profiled.build_programs(world, mesh, report, folder)
+    if first < run.iterations:
+        programs.get(min(run.chunk, run.iterations - first))
+    return programs
 
 
 def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Reporter | SilentReporter:
@@ -314,10 +298,10 @@ def _first_state(
     return resumption.restore(steps, state, trainer.describe_sharding(state, mesh))
 
 
-def _opening_lines(run: Path, c: Config, options: Options, first: int) -> list[str]:
+def _opening_lines(run: Path, c: Config, count: int, options: Options, first: int) -> list[str]:
     """Say what is trained, what it begins as, and what is not as before in a resumed run."""
     engine = resolve_engine(options.engine)
-    device = jax.devices()[0].device_kind
+    device = (f"{count} x " if count > 1 else "") + jax.devices()[0].device_kind
     start = f", from iteration {first}" if first else ""
     headline = (
         f"{run}: {c.robot.name} on {c.terrain.name}, {c.run.num_envs} robots, engine {engine}, "

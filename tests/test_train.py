@@ -22,7 +22,7 @@ from cref_jax import config, export, train
 from cref_jax.env.world import build_world
 from cref_jax.errors import CheckpointError, ConfigError
 from cref_jax.policy import reader, sources, trained, writer
-from cref_jax.training import devices, iteration, resumption, run_dir
+from cref_jax.training import devices, iteration, resumption, run_dir, trainer
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.progress import Reporter
 
@@ -146,6 +146,23 @@ TWO_STAGES += ["--iterations", "4"]
 
 
 @pytest.mark.slow
+def test_a_student_that_does_not_fit_leaves_its_teacher_to_resume(tmp_path, monkeypatch, capsys):
+    get = trainer.Programs.get
+
+    def refuse(programs, size):
+        if programs._world.config.network.variant == "hpl":
+            raise ConfigError("8 robots need 9.0 GiB")
+        return get(programs, size)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(trainer.Programs, "get", refuse)
+        run(tmp_path / "run", *TWO_STAGES)
+    jax.clear_caches()  # two runs in one process have many mappings, see conftest.py
+    run(tmp_path / "run", "--resume")
+    assert Checkpoints(tmp_path / "run" / "checkpoints").latest() == 4
+
+
+@pytest.mark.slow
 def test_a_run_of_two_stages_goes_on_from_either_bit_for_bit_and_walks_in_numpy(
     tmp_path, monkeypatch, capsys
 ):
@@ -240,6 +257,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
     ("arguments", "says"),
     [
         (["--terrain", "gpa"], "did you mean 'gap'?"),
+        (["--terrain.name", "gap"], "--terrain.name: say --terrain gap"),
         (["--experiment", "smok"], "did you mean 'smoke'?"),
         (["--num-envs", "0"], "--run.num-envs must be 1 to 1000000, not 0"),
         (["--num-envs", "510"], "take 508 or 512"),
@@ -312,9 +330,9 @@ def test_a_plugin_that_finds_no_gpu_is_no_silent_run_on_the_cpu(monkeypatch):
         train.jax.config.update("jax_platforms", None)
         for device in ("auto", "gpu"):
             with pytest.raises(ConfigError, match="plugin is installed and finds no GPU"):
-                train.select_device(device)
-        assert train.select_device("cpu") == "cpu"
-        assert train.select_device("auto") == "cpu"  # JAX_PLATFORMS=cpu, as this sets
+                devices.select_device(device)
+        assert devices.select_device("cpu") == "cpu"
+        assert devices.select_device("auto") == "cpu"  # JAX_PLATFORMS=cpu, as this sets
     finally:
         train.jax.config.update("jax_platforms", chosen)
 

@@ -275,10 +275,10 @@ def _check_learning_rate(c: Config) -> None:
 def _check_footholds(c: Config) -> None:
     """Refuse windows that no foothold can be found in."""
     points, window = c.foothold.points, c.foothold.window
-    if window[0] > points[0] or window[1] > points[1]:
+    if window[0] > points[0] or window[1] != points[1]:
         raise ConfigError(
-            f"--foothold.window, {window[0]} {window[1]}, must not be larger than "
-            f"--foothold.points, {points[0]} {points[1]}"
+            f"--foothold.window, {window[0]} {window[1]}, must be at most as long and exactly as "
+            f"wide as --foothold.points, {points[0]} {points[1]}"
         )
     if c.foothold.min_points > math.prod(window):
         raise ConfigError(

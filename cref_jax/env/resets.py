@@ -85,7 +85,8 @@ def _sample_start(
     x, z = uniform(key_x, *c.start_x), jnp.zeros(())
     if c.start_anywhere > 0.0:
         there, height = world.lanes.sample_level_place(kind, level, variant, key_where)
-        elsewhere = (jax.random.uniform(key_x) < c.start_anywhere) & jnp.isfinite(there)
+        chance = jax.random.uniform(jax.random.fold_in(key_where, 1))
+        elsewhere = (chance < c.start_anywhere) & jnp.isfinite(there)
         x, z = jnp.where(elsewhere, there, x), jnp.where(elsewhere, height, z)
     place = jnp.stack([x, uniform(key_y, *c.start_y), body.qpos[2] + z])
     return Body(

@@ -13,7 +13,7 @@ from cref_jax import terrain
 from cref_jax.env.state import EnvState
 from cref_jax.env.world import World
 
-PRESENT = 0.5  # chance of each to be there; assumed
+PRESENT = 0.5  # chance of each to be there, fully randomised; assumed
 FREE = 0.45  # m from the lane's middle to the nearest surface beside it; assumed: arms pass
 ABSENT = np.array([0.0, 0.0, -100.0, 0.0, 0.0, -100.0, 0.0], np.float32)  # far below everything
 
@@ -22,7 +22,8 @@ def sample_structures(world: World, state: EnvState) -> Float[Array, "S 7"]:
     """Draw the capsules of an episode: both ends and radius, m, in the lane's coordinates."""
     keys = jax.random.split(episode_key(world, state), world.config.randomisation.structures)
     ground = world.lanes.tile(state.level, state.kind, state.variant)
-    return jax.vmap(lambda k: _sample_structure(ground, world.lanes.end, k))(keys)
+    chance = PRESENT * state.spread.camera
+    return jax.vmap(lambda k: _sample_structure(ground, world.lanes.end, chance, k))(keys)
 
 
 def episode_key(world: World, state: EnvState, salt: int | None = None) -> PRNGKeyArray:
@@ -35,7 +36,7 @@ def episode_key(world: World, state: EnvState, salt: int | None = None) -> PRNGK
 
 
 def _sample_structure(
-    ground: terrain.Terrain, end: Float[Array, ""], key: PRNGKeyArray
+    ground: terrain.Terrain, end: Float[Array, ""], chance: Float[Array, ""], key: PRNGKeyArray
 ) -> Float[Array, "7"]:
     """Draw one capsule of a kind drawn by chance, or none."""
     key_present, key_kind, key_shape = jax.random.split(key, 3)
@@ -56,4 +57,4 @@ def _sample_structure(
     ]
     drawn = jnp.stack([jnp.concatenate([*ends, radius[None]]) for *ends, radius in of_kind])
     kind = jax.random.randint(key_kind, (), 0, len(of_kind))
-    return jnp.where(jax.random.uniform(key_present) < PRESENT, drawn[kind], ABSENT)
+    return jnp.where(jax.random.uniform(key_present) < chance, drawn[kind], ABSENT)

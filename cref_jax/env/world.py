@@ -13,9 +13,9 @@ from cref_jax.config import Config, describe_unknown
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Body, EngineName
 from cref_jax.physics.simulation import Physics, resolve_engine
-from cref_jax.terrain import lanes
+from cref_jax.terrain import lanes, map_files
 from cref_jax.terrain.atlas import Atlas
-from cref_jax.terrain.generators import KINDS
+from cref_jax.terrain.generators import KINDS, START
 
 
 @no_type_check  # vmap and tree.map fill it with batches, and with what is no array
@@ -46,8 +46,14 @@ def _check_lanes(c: Config, atlas: Atlas) -> None:
     for kind in c.command.open_kinds:
         if kind not in known:
             raise ConfigError(f"--command.open-kinds: {describe_unknown('kind', kind, known)}")
+    on_lanes = bool(set(atlas.kinds) - set(c.command.open_kinds))
+    if on_lanes and not map_files.is_map(c.terrain.name) and c.episode.start_x[1] > START:
+        raise ConfigError(
+            f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and obstacles "
+            f"may begin at {START:g} m"
+        )
     goal = float(atlas.end) - c.episode.lane_end
-    if set(atlas.kinds) - set(c.command.open_kinds) and c.episode.start_x[1] >= goal:
+    if on_lanes and c.episode.start_x[1] >= goal:
         raise ConfigError(
             f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and its goal, "
             f"--episode.lane-end before its end, is at {goal:g} m"

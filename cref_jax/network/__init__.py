@@ -1,6 +1,7 @@
 """The actor and the critic (Sec. II-B)."""
 
 from cref_jax.network.actor_critic import Actor, Critic
+from cref_jax.network.layers import floor_log_std
 from cref_jax.network.parkour import DEPTH_MLP, ParkourActor
 from cref_jax.network.records import (
     Carry,
@@ -27,6 +28,7 @@ __all__ = [
     "Output",
     "ParkourActor",
     "build_actor",
+    "floor_log_std",
     "image_to_patches",
     "initial_carry",
     "patches_to_image",

@@ -1,5 +1,6 @@
 """A trained policy, and its loading from a run."""
 
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,10 +65,12 @@ def load_policy(run: Path, world: World) -> TrainedPolicy:
 def learner_shapes(c: Config, world: World) -> ppo.TrainState:
     """Describe what a run with the settings `c` has learned: its shapes and dtypes.
 
-    Only the network is the world's, since another network's parameters are of no use in it.
+    Only the actor is the world's, since another actor's parameters are of no use in it.
     """
-    readout = {"ppo": {"readout_weight": c.ppo.readout_weight}}
-    as_trained = world.replace(config=override(world.config, readout))
+    critic = {"critic": c.network.critic, "critic_sees": c.network.critic_sees}
+    readout = {"readout_weight": c.ppo.readout_weight}
+    changes = {"network": critic, "ppo": readout, "scan": dataclasses.asdict(c.scan)}
+    as_trained = world.replace(config=override(world.config, changes))
     return jax.eval_shape(lambda w: iteration.initial_state(w).train, as_trained)
 
 

@@ -12,7 +12,7 @@ def start_from_policy(fresh: ppo.TrainState, policy: TrainedPolicy) -> ppo.Train
     statistics = fresh.statistics.obs.replace(
         mean=trained.mean,
         std=trained.std,
-        summed_variance=policy.samples * jnp.square(trained.std),
+        summed_variance=float(policy.samples) * jnp.square(trained.std),  # int32 holds too few
         count=fresh.statistics.obs.count + policy.samples,
     )
     return fresh.replace(

@@ -126,13 +126,15 @@ def _apply_gradients(
     """
     before = optax.tree.get(state.opt_state, "learning_rate")
     rate = adapt_learning_rate(before, losses.kl, c)
+    since = state.iteration - c.critic_first
+    hold = lambda tree: jax.tree.map(lambda x: jnp.where(since < 0, 0.0, x), tree)
     if c.critic_first:
-        since = state.iteration - c.critic_first
-        still = jax.tree.map(lambda g: jnp.where(since < 0, 0.0, g), grads.actor)
         rate = jnp.where(since > 0, rate, jnp.where(since < 0, before, c.learning_rate_range[0]))
-        grads = grads._replace(actor=still)
+        grads = grads._replace(actor=hold(grads.actor))
     opt_state = optax.tree.set(state.opt_state, learning_rate=rate)
     changes, opt_state = optimizer(c).update(grads, opt_state, state.params)
+    if c.critic_first:  # the optimiser may have come with momentum
+        changes = changes._replace(actor=hold(changes.actor))
     state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)
     return state, losses._replace(
         gradient_norm=optax.tree.norm(grads),

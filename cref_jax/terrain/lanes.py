@@ -41,6 +41,13 @@ def build(c: config.Terrain) -> Atlas:
     )
 
 
+def count_turns(c: config.Terrain) -> int:
+    """Count the robots among which each kind of lane has its share."""
+    if map_files.is_map(c.name):
+        return 1
+    return len(kind_files.round_robin_kinds(c.name, tuple(kind_files.read_kinds(c.name))))
+
+
 def build_single(c: config.Terrain, kind: str, size: float) -> Atlas:
     """Build one lane of one kind with obstacles of exactly this size, m."""
     return build_grid(c, {kind: (size,)}, [c.seed])

@@ -1,38 +1,74 @@
-"""Devices that the environments are sharded over, and their memory."""
+"""Devices: where a run goes on, how its environments are sharded, and their memory."""
 
 import contextlib
 import os
 import resource
 import sys
 from pathlib import Path
+from typing import Literal
 
 import jax
 from jax.sharding import Mesh
 
 from cref_jax.config import Config
 from cref_jax.errors import ConfigError
+from cref_jax.system import jax_setup
+from cref_jax.terrain import lanes
 from cref_jax.training import iteration
 
+Device = Literal["auto", "cpu", "gpu"]
 CONTAINER_LIMITS = (  # files of cgroup v2 and v1
     "/sys/fs/cgroup/memory.max",
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
 )
 
 
+def select_device(device: Device) -> Literal["cpu", "gpu"]:
+    """Choose where the program runs, before JAX is used for the first time.
+
+    Raises:
+        ConfigError: a GPU is asked for, or its plugin installed, and JAX has none.
+    """
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    is_chosen = jax.config.jax_platforms == "cpu"  # here, or by JAX_PLATFORMS
+    backend = jax.default_backend()
+    if backend != "gpu" and not is_chosen and jax_setup.has_cuda_plugin():
+        raise ConfigError(
+            "JAX's CUDA plugin is installed and finds no GPU: see whether nvidia-smi does, and "
+            "whether its driver is 525 or newer (cuda12), 580 (cuda13); --device cpu trains without"
+        )
+    if device == "gpu" and backend != "gpu":
+        raise ConfigError(
+            "--device gpu: JAX has no GPU here; install its plugin with: "
+            "pip install 'cref-jax[cuda12]' (driver 525 or newer) or 'cref-jax[cuda13]' (580)"
+        )
+    return "cpu" if backend == "cpu" else "gpu"
+
+
 def choose_mesh(c: Config, requested: int | None = None) -> Mesh:
     """Choose the devices to shard a run's robots over: `requested`, or as many as divide them.
 
+    Each device takes the kinds of lane in turn by itself, so it needs robots for a whole turn.
+
     Raises:
-        ConfigError: there are fewer devices, or the robots do not divide evenly.
+        ConfigError: there are fewer devices, the robots do not divide evenly, or a process of
+            several would have no device.
     """
-    available, parts = jax.device_count(), c.ppo.minibatches
-    even = [n for n in range(1, available + 1) if c.run.num_envs % (n * parts) == 0]
+    available, parts, turn = jax.device_count(), c.ppo.minibatches, lanes.count_turns(c.terrain)
+    fits = lambda n: c.run.num_envs % (n * parts) == 0 and (n == 1 or c.run.num_envs >= n * turn)
+    even = [n for n in range(1, available + 1) if fits(n)]
     if jax.process_count() > 1:  # each has a part
         requested = requested or available
+        if requested != available:
+            raise ConfigError(
+                f"--devices {requested}: several processes train on all of their {available}"
+            )
     if requested is not None and requested not in even:
+        each = f", {turn} and more on each for the kinds of lane" if turn > 1 else ""
         raise ConfigError(
             f"--devices {requested}: {c.run.num_envs} robots in {parts} minibatches can be "
-            f"sharded over {', '.join(map(str, even))} of the {available} devices here"
+            f"sharded over {', '.join(map(str, even))} of the {available} devices here{each}"
         )
     return iteration.make_mesh(requested or even[-1])
 

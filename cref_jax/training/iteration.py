@@ -17,7 +17,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float, Int, PyTree
 
-from cref_jax import config, ppo
+from cref_jax import config, network, ppo
 from cref_jax.env.world import World
 from cref_jax.ppo import Losses
 from cref_jax.training import distillation, mirror, randomization_ramp, rollout
@@ -143,6 +143,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
             update=jax.random.fold_in(key_update, jax.lax.axis_index(AXIS)),
         )
         train, robots, losses, trace = teach(world, nets, state.train, robots, keys, AXIS)
+        train = raise_deviations(train, c.network)
         return state.replace(train=train, robots=robots), losses, trace
 
     parts = partition(world)
@@ -158,14 +159,14 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     state, losses, trace = sharded_learn(world, state, key)
     falls = trace.ending.terminated.mean() * (60.0 / c.physics.control_period)
     state = state.replace(ramp=randomization_ramp.update_ramp(state.ramp, falls, c.randomisation))
-    samples = state.train.iteration * (c.run.num_envs * c.ppo.horizon)
+    samples = count_samples(c, state.train.iteration)
     log = {
         **_episode_log(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
         "train/action_std": std.mean(),
-        "train/samples": samples.astype(jnp.float32),
+        "train/samples": samples,
         "train/randomisation": state.ramp.share,
         **_stage_samples(c, samples),
     }
@@ -187,15 +188,27 @@ def _reinforce(
     return train, robots, losses, trace
 
 
-def _stage_samples(c: config.Config, samples: Int[Array, ""]) -> Log:
+def count_samples(c: config.Config, iteration: Int[Array, ""]) -> Float[Array, ""]:
+    """Count the control steps of experience until an iteration; more than int32 holds."""
+    return iteration.astype(jnp.float32) * float(c.run.num_envs * c.ppo.horizon)
+
+
+def raise_deviations(train: ppo.TrainState, c: config.Network) -> ppo.TrainState:
+    """Raise the actions' deviations to the least one: below it, they would get no gradient."""
+    if c.min_std == 0.0:
+        return train
+    actor = train.params.actor["params"]
+    raised = {"params": {**actor, "log_std": network.floor_log_std(actor["log_std"], c.min_std)}}
+    return train.replace(params=train.params._replace(actor=raised))
+
+
+def _stage_samples(c: config.Config, samples: Float[Array, ""]) -> Log:
     """Log the samples of teacher and student, in the second stage."""
     stages = distillation.samples_by_stage(c, c.run.iterations)
     if not stages:
         return {}
-    return {
-        "train/teacher_samples": jnp.float32(stages["teacher"]),
-        "train/student_samples": (samples - stages["teacher"]).astype(jnp.float32),
-    }
+    of_teacher = jnp.float32(stages["teacher"])
+    return {"train/teacher_samples": of_teacher, "train/student_samples": samples - of_teacher}
 
 
 def partition(world: World) -> RunState:

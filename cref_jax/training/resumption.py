@@ -58,7 +58,7 @@ def restore(steps: Checkpoints, state: RunState, here: dict[str, int]) -> RunSta
     if changes:
         print(changes)
     print("so what was learned is kept, the robots start anew, and the run is no longer the same")
-    return steps.restore(state, parts=("train",))[0]
+    return steps.restore(state, parts=("train", "ramp"))[0]
 
 
 @jax.jit

@@ -20,7 +20,7 @@ from cref_jax.env.observations import Observation
 from cref_jax.env.state import Ending, EnvState, even_spread
 from cref_jax.env.world import World
 from cref_jax.ppo import auxiliary
-from cref_jax.training import camera_feed
+from cref_jax.training import camera_feed, randomization_ramp
 from cref_jax.training.camera_feed import CameraFeed
 
 
@@ -138,7 +138,9 @@ def start(world: World, keys: Key[Array, " E"]) -> Robots:
     draw = lambda of, end: jax.vmap(lambda key: jax.random.randint(key, (), 0, end))(each[:, of])
     kinds = jnp.asarray(world.lanes.kind_of(np.arange(keys.shape[0])))
     levels = draw(0, min(c.curriculum.start_level, world.lanes.levels - 1) + 1)
-    state = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0))(world, each[:, 1], kinds, levels)
+    spread = even_spread(randomization_ramp.initial_ramp(c.randomisation).share)
+    reset = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, None))
+    state = reset(world, each[:, 1], kinds, levels, spread)
     state = state.replace(step=draw(2, round(c.episode.length / c.physics.control_period)))
     return init_robots(world, state, each[:, 3])
 

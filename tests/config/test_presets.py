@@ -56,6 +56,9 @@ def test_a_terrain_has_its_own_table_in_the_preset_of_a_device():
     flat, gap = presets.build_config("flat", None, "cpu"), presets.build_config("gap", None, "cpu")
     assert flat.network.variant == "blind" and gap.network.variant == "full"
     assert flat.run.num_envs == gap.run.num_envs == 256
+    on_gpu = presets.build_config("flat", None, "gpu")
+    assert on_gpu.network.variant == "blind" and on_gpu.run.num_envs == 4096
+    assert on_gpu.run.iterations * 4096 * 24 < 50e6  # minutes, not the paper's hours
     assert (
         not flat.randomisation.enabled
         and presets.build_config("gap", None, "gpu").randomisation.enabled
@@ -81,8 +84,9 @@ def test_an_experiment_changes_what_its_name_says(experiment, table, setting, va
     assert getattr(getattr(c, table), setting) == value
 
 
-def test_the_paper_is_the_same_on_every_device():
-    cpu, gpu = (presets.build_config("mixed", "paper", device) for device in ("cpu", "gpu"))
+@pytest.mark.parametrize("terrain", ["mixed", "flat"])
+def test_the_paper_is_the_same_on_every_device(terrain):
+    cpu, gpu = (presets.build_config(terrain, "paper", device) for device in ("cpu", "gpu"))
     assert cpu == gpu
     assert cpu.reward.event_time == cpu.physics.control_period  # a touchdown is one step's reward
     additions = cpu.reward.weights.air_time_variance, cpu.reward.weights.foot_up_when_standing

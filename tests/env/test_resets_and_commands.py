@@ -64,6 +64,8 @@ def test_a_share_of_the_robots_starts_on_any_level_stretch_before_the_last_obsta
     keys = jax.random.split(jax.random.key(3), 512)
     state = reset(world.replace(config=c), keys, fresh_states.kind, jnp.full(512, 2))
     x, kinds = np.asarray(state.body.qpos[:, 0]), np.array(world.lanes.kinds)[state.kind]
+    usual = x[kinds == "flat"]  # whoever is not elsewhere starts anywhere from 0.5 to 1 m
+    assert (usual < 0.6).any() and (usual > 0.9).any()
     away = x > 1.1  # m; the level start is 1.5 m long
     assert not away[(kinds == "flat") | (kinds == "rough")].any()  # nothing lies ahead there
     assert 0.15 < away[kinds == "gap"].mean() < 0.6  # half of the places are at the start, too

@@ -7,6 +7,7 @@ from small_world import C, one
 
 from cref_jax import config, terrain
 from cref_jax.env import environment, structures
+from cref_jax.env.state import even_spread
 
 SIX = config.override(C, {"randomisation": {"structures": 6}})
 
@@ -29,6 +30,11 @@ def test_half_of_them_are_there_and_none_is_in_the_way(world, fresh_states):
     assert nearest[beside].min() >= structures.FREE - 1e-6
     assert (nearest[beside] < 0.6).any() and (start[..., 1][beside] > 0).any()
     assert crosses.any()
+
+
+def test_while_nothing_is_randomised_there_are_none(world, fresh_states):
+    states = fresh_states.replace(spread=even_spread(jnp.zeros(512)))
+    assert (drawn(world, states)[..., 2] < -50.0).all()
 
 
 def test_those_that_cross_hang_above_the_robot(world, fresh_states):

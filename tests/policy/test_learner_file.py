@@ -10,7 +10,7 @@ from tiny_policy import SMALL
 
 from cref_jax import config
 from cref_jax.errors import ConfigError
-from cref_jax.policy import learner_file, sources
+from cref_jax.policy import learner_file, sources, warm_start
 from cref_jax.policy.trained import TrainedPolicy
 from cref_jax.training import iteration
 
@@ -46,6 +46,28 @@ def test_a_readout_comes_back_where_none_is_trained(small, tmp_path):
     learner_file.write(policy, policy.run)
     back = sources.load(policy.run, small)
     jax.tree.map(np.testing.assert_array_equal, back.train, policy.train)
+
+
+def test_a_critic_of_another_size_comes_back_as_it_was(small, tmp_path):
+    other = {"network": {"critic": [5, 3], "critic_sees": "paper"}, "scan": {"x": [0.0, 1.0, 4]}}
+    policy = learned(small.replace(config=config.override(small.config, other)), tmp_path / "a.npz")
+    learner_file.write(policy, policy.run)
+    back = sources.load(policy.run, small)
+    jax.tree.map(np.testing.assert_array_equal, back.train, policy.train)
+
+
+def test_a_policy_of_billions_of_samples_begins_another_training(small, tmp_path):
+    policy = learned(small, tmp_path / "learned.npz")
+    many = config.override(small.config, {"run": {"num_envs": 32768}})
+    policy = policy._replace(config=many, iteration=3000)
+    assert policy.samples == 3000 * 32768 * 24  # 2.4 billion
+    fresh = jax.eval_shape(lambda w: iteration.initial_state(w).train, small)
+    fresh = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), fresh)
+    began = warm_start.start_from_policy(fresh, policy)
+    found = began.statistics.obs
+    assert int(found.count) == policy.samples
+    variance = np.square(policy.train.statistics.obs.std)
+    np.testing.assert_allclose(found.summed_variance, policy.samples * variance, rtol=1e-6)
 
 
 def test_a_policy_is_summarized_as_it_is_described(small, tmp_path):

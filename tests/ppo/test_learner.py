@@ -493,6 +493,13 @@ def test_the_critic_alone_learns_first_and_the_actor_begins_at_the_lowest_rate()
     assert not same(critics[0], critics[1]) and not same(critics[1], critics[2])
 
 
+def test_the_actor_waits_for_the_critic_though_its_optimiser_has_momentum():
+    moving, _ = update(initial_state(), some_rollout(), KEY)
+    c = dataclasses.replace(C, critic_first=2)
+    still, _ = ppo.update(moving.replace(iteration=jnp.array(1)), some_rollout(), KEY, c, NETWORKS)
+    jax.tree.map(np.testing.assert_array_equal, still.params.actor, moving.params.actor)
+
+
 @pytest.mark.parametrize(("iteration", "share"), [(0, 1.0), (30, 1 / 4), (10**6, 1 / 201)])
 def test_the_average_fades_over_a_tenth_of_all_iterations_up_to_a_limit(iteration, share):
     before = initial_state().replace(iteration=jnp.array(iteration))

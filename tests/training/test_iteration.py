@@ -1,0 +1,52 @@
+"""What an iteration keeps and counts besides what PPO learns."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_world
+from tiny_policy import SMALL
+
+from cref_jax import config
+from cref_jax.training import iteration, rollout
+
+
+def test_a_deviation_below_the_least_is_raised_to_it():
+    world = small_world.world().replace(config=dataclasses.replace(small_world.C, network=SMALL))
+    train = jax.jit(iteration.initial_state)(world).train
+    stds = np.where(np.arange(12) < 6, 0.13, 0.4).astype(np.float32)
+    actor = {"params": {**train.params.actor["params"], "log_std": jnp.log(stds)}}
+    train = train.replace(params=train.params._replace(actor=actor))
+    raised = iteration.raise_deviations(train, dataclasses.replace(SMALL, min_std=0.25))
+    found = np.exp(raised.params.actor["params"]["log_std"])
+    np.testing.assert_allclose(found, np.where(np.arange(12) < 6, 0.25, 0.4), rtol=1e-6)
+    assert iteration.raise_deviations(train, SMALL) is train
+
+
+def test_billions_of_samples_are_counted():
+    c = config.override(small_world.C, {"run": {"num_envs": 32768}})
+    count = jax.jit(lambda k: iteration.count_samples(c, k))(jnp.int32(3000))
+    assert float(count) == pytest.approx(3000 * 32768 * 24)  # 2.36e9; int32 ends at 2.15e9
+
+
+def test_the_samples_of_a_teacher_of_billions_are_counted():
+    c = config.override(small_world.C, {"run": {"num_envs": 8192}, "network": {"variant": "hpl"}})
+    log = jax.jit(lambda k: iteration._stage_samples(c, iteration.count_samples(c, k)))
+    found = log(jnp.int32(19_000))  # of 20,000 iterations 18,000 are the teacher's
+    assert float(found["train/teacher_samples"]) == pytest.approx(18_000 * 8192 * 24)
+    assert float(found["train/student_samples"]) == pytest.approx(1000 * 8192 * 24, rel=1e-5)
+
+
+@pytest.mark.parametrize("ramp", [True, False])
+def test_the_first_episodes_are_randomised_as_much_as_the_ramp_says(ramp):
+    world = small_world.world()
+    c = config.override(small_world.C, {"randomisation": {"enabled": True, "ramp": ramp}})
+    keys = jax.random.split(jax.random.key(0), 28)
+    robots = jax.jit(rollout.start)(world.replace(config=c), keys)
+    assert bool((robots.env.dynamics.payload == 0.0).all()) == ramp
+    assert bool((robots.env.joint_offset == 0.0).all()) == ramp
+    np.testing.assert_array_equal(robots.env.spread.mass, np.full(28, 0.0 if ramp else 1.0))
+    assert math.isfinite(float(robots.env.body.qpos.sum()))
