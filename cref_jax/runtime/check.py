@@ -10,9 +10,9 @@ import numpy as np
 
 from cref_jax.runtime.files import contents
 from cref_jax.runtime.legs import Legs
-from cref_jax.runtime.policy import Policy
+from cref_jax.runtime.policy import START_AFTER, Policy
 from cref_jax.runtime.recorder import INPUTS
-from cref_jax.runtime.status import WHY, Status
+from cref_jax.runtime.status import FAULTS, WHY, Status
 from cref_jax.runtime.tables import PolicyFormatError, Table
 
 STILL_SECONDS = 5.0
@@ -45,14 +45,18 @@ def replay(
 ) -> tuple[list[str], float]:
     """Give a recording to a policy again; return when which status began, and the largest change.
 
-    The change is that of a target, rad; it is 0 if nothing was lost before the recording.
+    The change is that of a target, rad; it is 0 if no step and no frame was lost.
     """
     kept = read_recording(recording)
-    runtime = Policy(*contents(policy), float(kept["depth_scale"]))
+    careful, start_after = bool(kept.get("careful", True)), kept.get("start_after", START_AFTER)
+    runtime = Policy(*contents(policy), float(kept["depth_scale"]), careful, float(start_after))
+    told_to_stop = kept.get("told_to_stop", np.zeros(len(kept["now"]), bool))
     lines, before, largest = [], Status.OK, 0.0
     for t in range(len(kept["now"])):
         for k in np.flatnonzero(kept["frame_step"] == t):
             runtime.on_depth(kept["frames"][k], kept["stamps"][k])
+        if told_to_stop[t]:
+            runtime.stop()
         target = runtime.step(*(kept[name][t] for name in INPUTS))
         if "target" in kept and kept["target"].shape[1:] == target.shape:
             largest = max(largest, float(np.abs(target - kept["target"][t]).max()))
@@ -68,11 +72,13 @@ def check(policy: str | os.PathLike[str], recording: str | os.PathLike[str]) -> 
     manifest, arrays = contents(policy)
     root, kept = Table(manifest, "manifest"), read_recording(recording)
     runtime = Policy(manifest, arrays)
+    unusable = [*_check_inputs(kept, len(runtime.joints.names))]
+    refused = [*_check_status(kept)]
+    if unusable:
+        return unusable + refused
     seconds = float(kept["now"][-1] - kept["now"][0])
     odd = [] if seconds >= STILL_SECONDS else [f"only {seconds:.1f} s, at least 5 are needed"]
-    finite = [bool(kept[name].size and np.isfinite(kept[name]).all()) for name in INPUTS]
-    if not all(finite):
-        return [*odd, f"not always numbers: {', '.join(np.array(INPUTS)[~np.array(finite)])}"]
+    odd += refused
     odd += _check_times(kept, runtime.period)
     odd += _check_senses(kept, runtime)
     if root.has("legs"):
@@ -80,6 +86,25 @@ def check(policy: str | os.PathLike[str], recording: str | os.PathLike[str]) -> 
     if not runtime.blind:
         odd += _check_camera(kept, manifest["depth"], runtime)
     return odd
+
+
+def _check_inputs(kept: dict[str, np.ndarray], joints: int) -> Iterator[str]:
+    shapes = ((3,), (3,), (3,), (joints,), (joints,), (), ())
+    for name, shape in zip(INPUTS, shapes):
+        given = kept[name].shape[1:]
+        if kept[name].size and given != shape:
+            yield f"{name} has the shape {given} in a step, in place of {shape}"
+    finite = [bool(kept[name].size and np.isfinite(kept[name]).all()) for name in INPUTS]
+    if not all(finite):
+        yield f"not always numbers: {', '.join(np.array(INPUTS)[~np.array(finite)])}"
+
+
+def _check_status(kept: dict[str, np.ndarray]) -> Iterator[str]:
+    status = kept.get("status", np.zeros(0, np.int64))
+    for flag, words in WHY.items():
+        count = np.count_nonzero(status & int(flag & FAULTS))
+        if count:
+            yield f"{count} of {len(status)} steps: {words}"
 
 
 def _check_times(kept: dict[str, np.ndarray], period: float) -> Iterator[str]:
@@ -134,7 +159,8 @@ def _check_camera(
         yield f"{100 * known.mean():.0f} % of the pixels show anything nearer than d_max"
         return
     pitch, wanted = _fit_pitch(metres, known, depth), depth["mount"]["pitch_deg"]
-    pitch += np.degrees(np.arctan2(kept["gravity"][-1][0], -kept["gravity"][-1][2]))
+    x, _, z = kept["gravity"][-1]
+    pitch -= np.degrees(np.arctan2(x, -z))  # by as much the robot's nose is down, and the camera
     if abs(pitch - wanted) > MOST_TILT:
         yield (
             f"the camera looks down by {pitch:.0f} deg, in place of {wanted:.0f}, if the ground is "

@@ -19,7 +19,7 @@ from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.network import VARIANTS
 from cref_jax.runtime.nudge import Nudge
-from cref_jax.runtime.recorder import Recorder
+from cref_jax.runtime.recorder import Recorder, to_time
 from cref_jax.runtime.senses import Senses
 from cref_jax.runtime.status import (
     FAULTS,
@@ -118,7 +118,7 @@ class Policy:
         legs = Legs(root, self.joints.names) if careful and root.has("legs") else None
         self._senses = Senses(self.joints, legs, self.period, careful)
         self._nudge = Nudge(legs, self.joints, self.period) if legs else None
-        self.recorder = Recorder(self.period, depth_scale)
+        self.recorder = Recorder(self.period, depth_scale, careful, start_after)
         self._obs = np.zeros(size, np.float32)
         self._target = np.zeros(count, np.float32)
         self._lock = threading.Lock()
@@ -231,7 +231,8 @@ class Policy:
             if self._begun and not status & FAULTS:
                 status |= self._act(bool(status & Status.STOPPED))
         target = self._choose(status)
-        self.recorder.add_step((*inputs, now, commanded), target, int(self.status))
+        given = (*inputs, now, commanded)
+        self.recorder.add_step(given, target, int(self.status), self._told_to_stop)
         return target
 
     @property
@@ -376,11 +377,3 @@ class Policy:
             held = self.joints.default if first is None else first
             return held + self._nudge.offset() if self._nudge and self._good else held.copy()
         return (self._senses.q if self._damping else self._target).copy()
-
-
-def to_time(value: Any) -> float:
-    """Convert to s; NaN unless the value is a number."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan

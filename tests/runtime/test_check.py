@@ -14,7 +14,7 @@ from cref_jax.policy.sources import bundled_policy
 POLICY = bundled_policy("robust")
 
 
-def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value, **options):
+def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value, stop_at=None, **options):
     """Record a robot that stands before level ground; `change` makes one input wrong."""
     policy, rng = deploy.load(POLICY, **options), np.random.default_rng(0)
     q = policy.joints.default
@@ -31,6 +31,8 @@ def standing(tmp_path, seconds=6.0, change=lambda name, value, k: value, **optio
             "now": 0.02 * k,
             "commanded": 0.02 * k,
         }
+        if k == stop_at:
+            policy.stop()
         policy.step(*(change(name, value, k) for name, value in inputs.items()))
     policy.recorder.write(tmp_path / "standing.npz")
     return tmp_path / "standing.npz"
@@ -58,11 +60,77 @@ def test_of_a_robot_that_stands_nothing_is_odd(tmp_path):
         ("frame", lambda f: f[::-1], "looks down by"),
         ("frame", lambda f: f + 9.0, "0 % of the pixels"),
         ("qd", lambda v: None, "not always numbers: qd"),
+        ("q", lambda q: np.arange(31) / 31, "q has the shape (31,) in a step, in place of (12,)"),
+        ("gravity", lambda g: np.r_[1.0, 0, 0, 0], "gravity has the shape (4,) in a step, in"),
+        ("command", lambda c: np.zeros(2), "300 of 300 steps: an input cannot be used"),
+        ("gravity", lambda g: 9.81 * g, "300 of 300 steps: an input cannot be used"),
+        ("gravity", lambda g: -g, "300 of 300 steps: gravity must be near (0, 0, -1)"),
     ],
 )
 def test_what_is_odd_is_named(tmp_path, which, by, words):
     odd = deploy.check(POLICY, standing(tmp_path, change=one(which, by)))
     assert any(words in line for line in odd), odd
+
+
+@pytest.mark.parametrize("nose_down", [4.0, -4.0])
+def test_a_robot_that_leans_forward_looks_down_by_as_much_more(tmp_path, nose_down):
+    lean = np.radians(nose_down)  # gravity points to where the robot leans
+    by_lean = np.array([np.sin(lean), 0.0, 1.0 - np.cos(lean)])
+    changes = {
+        "gravity": lambda gravity: gravity + by_lean,
+        "frame": lambda frame: frame + ground(pitch=50.0 + nose_down) - ground(),
+    }
+    change = lambda name, value, k: changes.get(name, lambda same: same)(value)
+    assert deploy.check(POLICY, standing(tmp_path, change=change)) == []
+
+
+def test_a_step_that_was_refused_is_counted(tmp_path):
+    glitch = lambda name, value, k: value + 10.0 * (k == 200) if name == "q" else value
+    odd = deploy.check(POLICY, standing(tmp_path, change=glitch))
+    assert odd[0] == "1 of 300 steps: an input cannot be used"
+
+
+def walk(name, value, k):
+    return np.array([0.4, 0.0, 0.0]) if name == "command" else value
+
+
+@pytest.mark.parametrize("options", [{"start_after": 2.0}, {"stop_at": 150}, {"careful": False}])
+def test_a_replay_loads_and_stops_the_policy_as_it_was(tmp_path, options):
+    kept = standing(tmp_path, change=walk, **options)
+    assert deploy.replay(POLICY, kept)[1] == 0.0
+    with np.load(kept) as file:  # as it was written before these were kept
+        left = {name: file[name] for name in {*file} - {"careful", "start_after", "told_to_stop"}}
+    np.savez(tmp_path / "old.npz", **left)
+    assert deploy.replay(POLICY, tmp_path / "old.npz")[1] > 0.01
+
+
+def test_whole_numbers_now_and_then_are_kept_beside_fractions(tmp_path):
+    command = lambda k: (0, 0, 0) if k < 200 else (0.5, 0.0, 0.0)
+    kept = standing(tmp_path, change=lambda name, x, k: command(k) if name == "command" else x)
+    np.testing.assert_array_equal(np.load(kept)["command"][:, 0], np.repeat([0.0, 0.5], [200, 100]))
+    assert deploy.replay(POLICY, kept)[1] == 0.0
+
+
+class Stamp:
+    def __float__(self):
+        raise RuntimeError
+
+
+def test_a_stamp_that_is_no_number_spoils_no_recording(tmp_path):
+    kept = standing(tmp_path, change=one("stamp", lambda t: Stamp() if t > 1.0 else t))
+    # every 0.1 s one of 20 ms before: the 11th is of 0.98 s
+    np.testing.assert_array_equal(np.isnan(np.load(kept)["stamps"]), np.arange(60) > 10)
+    lines, largest = deploy.replay(POLICY, kept)
+    assert any("BAD_DEPTH" in line for line in lines) and largest == 0.0
+
+
+def test_frames_take_no_more_than_64_mib(tmp_path):
+    policy = deploy.load(POLICY)
+    for k in range(20):  # of 4 MiB
+        policy.on_depth(np.zeros((1024, 1024), np.float32), 0.1 * k)
+    policy.step(*[np.zeros(3)] * 5, 0.0)
+    policy.recorder.write(tmp_path / "large.npz")
+    np.testing.assert_allclose(np.load(tmp_path / "large.npz")["stamps"], 0.1 * np.arange(4, 20))
 
 
 def test_a_recording_knows_the_unit_of_raw_frames(tmp_path):
