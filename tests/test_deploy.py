@@ -217,13 +217,25 @@ def test_without_a_last_target_a_bad_input_is_no_start(robot):
     assert robot.status & Status.NOT_STARTED
 
 
-def test_the_memory_of_an_answer_that_is_not_finite_is_never_used():
+@pytest.fixture
+def broken():
+    """Return a policy whose answers are not finite."""
     manifest, arrays = contents(policy("full"))
     arrays = {k: np.array(x) for k, x in arrays.items()}
     arrays["action_head/layer_1/bias"][:] = arrays["action_head/layer_2/kernel"][:] = 3e38
-    robot = deploy.Policy(manifest, arrays, careful=False)
-    assert np.isfinite(robot.step(*still())).all()
-    assert robot.status & Status.BAD_ACTION
+    return deploy.Policy(manifest, arrays, careful=False)
+
+
+def test_the_memory_of_an_answer_that_is_not_finite_is_never_used(broken):
+    assert np.isfinite(broken.step(*still())).all()
+    assert broken.status & Status.BAD_ACTION
+
+
+def test_without_a_last_target_an_answer_that_is_not_finite_holds_the_joints(broken):
+    for k in range(2):  # where they are now, while they sink
+        sunk = ROBOT.nominal_pose + np.float32(0.1 * (k + 1))
+        np.testing.assert_array_equal(broken.step(*still(q=sunk, now=k * PERIOD)), sunk)
+        assert broken.status & Status.BAD_ACTION and broken.status & Status.HOLDING
 
 
 def test_commands_stay_within_what_was_trained(robot):

@@ -48,6 +48,17 @@ def test_an_input_of_another_unit_sign_or_axis_is_named(changes, flag, words):
     assert said(robot, now=PERIOD) == Status.OK  # and forgotten when it is right
 
 
+def test_a_speed_that_is_done_without_is_that_of_this_step_alone():
+    robot, told = runtime(), runtime()
+    for k in range(100):
+        q = ROBOT.nominal_pose + np.float32(0.001 * k)  # rad in 0.02 s: 0.05 rad/s
+        too_fast = k in (20, 99)
+        ours = robot.step(*still(q=q, qd=np.full(J, 60.0 if too_fast else 0.0), now=k * PERIOD))
+        theirs = told.step(*still(q=q, qd=np.full(J, 0.05 * too_fast), now=k * PERIOD))
+        assert bool(robot.status & Status.JOINTS_TOO_FAST) == too_fast
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
 def test_before_a_first_good_input_the_pose_measured_first_is_held():
     robot, first = runtime(), ROBOT.nominal_pose + np.float32(0.02)
     upside_down = {"gravity": [0.0, 0.0, 1.0]}
@@ -96,10 +107,15 @@ def test_what_hangs_before_a_camera_that_is_the_right_way_up_is_seen():
     assert robot.on_depth(ground()[::-1], 0.05) == Status.OK
 
 
-def test_the_same_frame_again_and_again_is_a_frozen_camera():
+@pytest.mark.parametrize(
+    ("hole", "unit", "kind"), [(1.5, 1.0, "f4"), (np.nan, 1.0, "f4"), (0.0, 1e3, "u2")]
+)
+def test_the_same_frame_again_and_again_is_a_frozen_camera(hole, unit, kind):
     robot, rng = runtime(), np.random.default_rng(0)
     for k in range(30):
         noisy = ground() + rng.normal(0.0, 1e-3, (48, 64)).astype(np.float32)
+        noisy[20:24, 30:40] = hole
+        noisy = (unit * noisy).astype(kind)
         assert robot.on_depth(noisy, 0.05 * k) == Status.OK
     assert {robot.on_depth(noisy, 2.0 + 0.05 * k) for k in range(12)} == {Status.OK}  # it stands
     robot.step(*still(q=ROBOT.nominal_pose + np.float32(0.06)))
@@ -197,8 +213,8 @@ def test_a_clock_in_milliseconds_is_late_at_every_step():
     assert robot.status & Status.STOPPED
 
 
-def careful(variant="full"):
-    return deploy.Policy(*contents(policy(variant)))
+def careful(variant="full", **options):
+    return deploy.Policy(*contents(policy(variant)), **options)
 
 
 def noisy_still(rng, now, **changes):
@@ -219,6 +235,18 @@ def test_it_does_not_start_before_a_frame():
         target = robot.step(*noisy_still(rng, k * PERIOD))
         assert robot.status & ~Status.STOPPED == Status.OK
     assert np.abs(target - first[3]).max() > 0.01  # after 0.2 s, by the network
+
+
+def test_no_start_comes_before_the_hips_have_swung():
+    soon, usual, rng = (
+        careful("blind", start_after=0.04),
+        careful("blind"),
+        np.random.default_rng(0),
+    )
+    for k in range(15):  # the swing takes 0.16 s and two steps: 0.2 s in all, as long as usual
+        inputs = noisy_still(rng, k * PERIOD)
+        np.testing.assert_array_equal(soon.step(*inputs), usual.step(*inputs))
+        assert soon.status == usual.status == Status.OK
 
 
 @pytest.mark.parametrize("joint", [3, 4])

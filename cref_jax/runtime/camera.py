@@ -112,7 +112,7 @@ class Camera:
 
     def _look_through(self, frame: np.ndarray, seen: np.ndarray, q: np.ndarray) -> Status:
         """Notice a camera that shows no ground ahead; `seen` is in m, up to d_max."""
-        if self._frame is not None and np.array_equal(frame, self._frame):
+        if self._frame is not None and np.array_equal(frame, self._frame, equal_nan=True):
             self._repeats += 1
             assert self._q is not None
             if self._repeats >= FROZEN_FRAMES and np.abs(q - self._q).max() > FROZEN_MOTION:

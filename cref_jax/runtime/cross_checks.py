@@ -116,10 +116,15 @@ class CrossChecks:
 
     def reset(self) -> None:
         """Forget everything."""
+        self.wrong = Status.OK
+        self._frame = np.eye(3)  # from the axes of the wrong sense to the base's
+        self.forget_history()
+
+    def forget_history(self) -> None:
+        """Forget the steps before, but not what they have shown to be wrong."""
         pairs = (self._speeds, self._turns, self._rolls, self._targets, self._exchanged)
         for agreement in pairs:
             agreement.reset()
-        self.wrong = Status.OK
         self._before: tuple[np.ndarray, ...] | None = None
         self._recent = np.zeros((4, 2))  # turns of late: gravity, the same by the gyro, legs, gyro
         self._moves = np.zeros((2, self._joints))  # of late: of targets, of joints
@@ -127,13 +132,14 @@ class CrossChecks:
         self._moved = np.zeros(self._joints)  # rad, in this step
         self._change = np.zeros(3)  # of gravity in this step
         self._same = np.zeros(4, int)  # steps with the same gyro, gravity, q and qd
-        self._frame = np.eye(3)  # from the axes of the wrong sense to the base's
 
     def compare(self, *senses: np.ndarray, forget: bool = False) -> Status:
         """Compare angular velocity, gravity, q, qd and the last target with those of before.
 
         What was wrong once stays so, unless it is to `forget`, as before a start.
         """
+        if forget:
+            self.wrong = Status.OK
         before, self._before = self._before, tuple(x.astype(float) for x in senses)
         if before is None:
             return self.wrong
@@ -148,8 +154,6 @@ class CrossChecks:
         self._exchanged.add(self._delayed[0], self._moves[1][self._across])
         equal = [bool((x == y).all()) for x, y in zip(self._before, before)]
         self._same = np.where(equal[:4], self._same + 1, 0)
-        if forget:
-            self.wrong = Status.OK
         if self._speeds.count > LEAST_STEPS:
             stands = forget or self._speeds.count < FEET_STAND
             self.wrong |= self._judge_joints() | self._judge_imu(stands) | self._judge_frozen()

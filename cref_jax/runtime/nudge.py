@@ -60,9 +60,13 @@ class Nudge:
 
     def add(self, q: np.ndarray, angular_velocity: np.ndarray) -> None:
         """Add what was measured in a step, rad [J] and rad/s [3]."""
-        if self.possible and len(self._q) < self._steps:
+        if not self.is_over():
             self._q.append(q.copy())
             self._w.append(angular_velocity.copy())
+
+    def is_over(self) -> bool:
+        """Check whether all of the swing has been measured, or none is possible."""
+        return not self.possible or len(self._q) >= self._steps
 
     def judge(self) -> Status:
         """Find out which signs are wrong and whether the legs are exchanged; sets `detail`."""

@@ -60,8 +60,9 @@ def load(
         careful: wait for a frame, start on level feet alone, swing the hips a little before that
             and move to the default pose slowly; compare the senses with each other, and stop when
             they disagree.
-        start_after: s, for which all must be right before a careful start, while the pose measured
-            first is held; longer is better where the robot is held up.
+        start_after: s, for which all must be right before a careful start, and at least until the
+            hips have swung (0.2 s), while the pose measured first is held; longer is better where
+            the robot is held up.
 
     Raises:
         PolicyFormatError: a file is missing, damaged or of another format, or the joints differ.
@@ -120,7 +121,6 @@ class Policy:
         self._nudge = Nudge(legs, self.joints, self.period) if legs else None
         self.recorder = Recorder(self.period, depth_scale, careful, start_after)
         self._obs = np.zeros(size, np.float32)
-        self._target = np.zeros(count, np.float32)
         self._lock = threading.Lock()
         self.reset()
 
@@ -144,7 +144,8 @@ class Policy:
             self._nudge.reset()
         self._refused = Status.OK  # what the nudge has shown to be wrong
         self.recorder.reset()
-        self._previous = np.zeros(len(self.joints.names), np.float32)
+        self._target = self.joints.default.copy()
+        self._previous = np.zeros_like(self._target)
         self._before: float | None = None  # time of the last step, s
         self._good = 0  # steps in a row before the start in which all was right
         self._wait = self._start_after  # s, for which all must be right
@@ -303,7 +304,7 @@ class Policy:
         ready = self._good > 0 and self._good * self.period > self._wait - 1e-6
         if refused := self._watch_nudge(ready):
             self._refused, self._good, ready = refused, 0, False
-        self._begun = ready
+        self._begun = ready and (self._nudge is None or self._nudge.is_over())
         first, default = self._senses.q.copy(), self.joints.default
         way = float(np.abs(default - first).max())
         if self._begun and way > FAR:
@@ -339,6 +340,8 @@ class Policy:
         with self._lock:
             action = self._actor(self._obs)
         if not np.isfinite(action).all():
+            if not self._aimed:  # there is no good target to hold
+                self._target[:] = senses.q
             return status | Status.BAD_ACTION
         np.clip(action, -self._action_clip, self._action_clip, out=self._previous)
         return status | self._aim()

@@ -68,10 +68,9 @@ class Senses:
         if status & FAULTS:
             return status
         held = self._joints.default if target is None else target
-        if self._careful or status:
-            wrong = self._checks.compare(w, g, q, qd, held, forget=target is None)
-            status |= wrong if self._careful else Status.OK
-            w, g, qd = self._checks.mend(status)
+        wrong = self._checks.compare(w, g, q, qd, held, forget=target is None)
+        status |= wrong if self._careful else Status.OK
+        w, g, qd = self._checks.mend(status)
         self.angular_velocity, self.gravity, self.command, self.qd = w, g, command, qd
         return status
 
@@ -101,7 +100,7 @@ class Senses:
         possible = (q > joints.low - POSE_MARGIN) & (q < joints.high + POSE_MARGIN)
         if not possible.all():
             worst = joints.names[int(np.argmin(possible))]
-            self._checks.reset()
+            self._checks.forget_history()
             self.detail = f"q is beyond the range of {worst}: degrees, or another order?"
             return False
         if np.ptp(q) == 0.0 and np.ptp(joints.default) > 0.0:

@@ -17,7 +17,7 @@ from c_policy import (
     leave_out_cross_checks,
     write,
 )
-from robot_faults import Robot
+from robot_faults import Robot, ground
 from tiny_policy import SMALL, J, contents, metres, policy, recorded
 
 from cref_jax import deploy
@@ -188,13 +188,43 @@ def test_an_action_that_is_not_finite_is_a_fault(tmp_path, monkeypatch):
     calls = Calls(J)
     both = Both(manifest, arrays, calls, at_once=True)
     robot = Robot(both.joints, 0)
-    expected = []
+    expected, poses = [], []
     for k in range(8):
         inputs, _, _ = robot.measure()
+        poses.append(inputs[3])
         expected.append(both.step(*inputs, now=k * PERIOD, commanded=k * PERIOD))
     answers = calls.answer(build(write(manifest, arrays, tmp_path)))
     assert_equal(answers[2:], expected)
     assert expected[0][0] & Status.BAD_ACTION and expected[7][0] & Status.DAMPING
+    np.testing.assert_array_equal(expected[0][1], poses[0])  # the joints are held where they are
+
+
+def test_begun_at_once_without_a_usable_input_it_holds_the_default_pose(programs, monkeypatch):
+    leave_out_cross_checks(monkeypatch)
+    calls, nothing = Calls(J), np.full(3, np.nan)
+    both = Both(*tiny("blind"), calls, at_once=True)
+    unknown = np.full(J, np.nan)
+    expected = [both.step(*[nothing] * 3, unknown, unknown, now=0.0, commanded=0.0)]
+    np.testing.assert_array_equal(expected[0][1], both.joints.default)
+    assert_equal(calls.answer(programs("blind"))[2:], expected)
+
+
+def test_a_frozen_camera_is_noticed_by_its_joints_though_its_frames_have_holes(
+    programs, monkeypatch
+):
+    leave_out_cross_checks(monkeypatch)
+    calls, expected, frame = Calls(J), [], ground()
+    both, still = Both(*tiny(), calls), np.zeros(3, np.float32)
+    frame[20:24, 30:40] = np.nan
+    for k in range(8):
+        q = both.joints.default + np.float32(0.02 * k)  # more than 0.05 rad away from the fourth on
+        now = k * PERIOD
+        expected.append(both.on_depth(frame, now))
+        inputs = (still, np.float32([0.0, 0.0, -1.0]), still, q, np.zeros(J, np.float32))
+        expected.append(both.step(*inputs, now=now, commanded=now))
+    # a frame comes before the step's joints: those of the fourth step count for the fifth frame
+    assert expected[::2] == [Status.OK] * 4 + [Status.FROZEN_DEPTH] * 4
+    assert_equal(calls.answer(programs("full"))[1:], expected)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,9 @@ from tiny_policy import ROBOT, J, contents, policy
 
 from cref_jax.deploy import Status
 from cref_jax.runtime.cross_checks import CrossChecks
+from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
+from cref_jax.runtime.senses import Senses
 from cref_jax.runtime.tables import Table
 
 PERIOD = 0.02
@@ -178,3 +180,19 @@ def test_before_a_start_what_was_wrong_is_forgotten_when_it_is_right(legs):
     for k, (w, g, q, qd, target) in enumerate(zip(*true, strict=True)):
         seen.append(checks.compare(-w if k < 60 else w, g, q, qd, target, forget=True))
     assert seen[50] == Status.GYRO_WRONG and seen[-1] == Status.OK
+
+
+def test_joint_angles_that_are_impossible_once_make_no_wrong_sense_right(legs):
+    joints = read_joints(Table(contents(policy("full"))[0], "manifest"))
+    senses, said, turned = Senses(joints, legs, PERIOD, careful=True), [], []
+    for k, (w, g, q, qd, target) in enumerate(zip(*motion(), strict=True)):
+        q_read = q + 10.0 * (k == 100)
+        said.append(senses.take([-w, g, np.zeros(3), q_read, qd], target.astype(np.float32)))
+        turned.append(senses.angular_velocity)
+    assert said[99] == Status.GYRO_WRONG and said[100] == Status.BAD_INPUT
+    assert set(said[101:]) == {Status.GYRO_WRONG}
+    turns = motion()[0][101, :2]
+    np.testing.assert_allclose(turned[101][:2], turns, atol=1e-6)  # turned back at once
+    senses.reset()
+    again = zip(*motion(), strict=True)
+    assert {senses.take([w, g, w, q, qd], q) for w, g, q, qd, _ in again} == {Status.OK}

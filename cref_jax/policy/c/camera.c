@@ -13,10 +13,7 @@ static bool is_known(float depth)
 /* Check whether joints move while the camera sends the same frame again and again. */
 static bool is_frozen(cref_policy *p, const float *depth)
 {
-    bool same = p->has_frame;
-    for (int i = 0; same && i < PIXELS; i++)
-        same = depth[i] == p->frame[i];
-    if (same)
+    if (p->has_frame && memcmp(depth, p->frame, sizeof p->frame) == 0) /* NaN equals itself */
         return ++p->repeats >= FROZEN_FRAMES &&
                compare_poses(p->q, p->frame_q) > (float)FROZEN_MOTION;
     p->repeats = 0;

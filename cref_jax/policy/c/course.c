@@ -113,8 +113,11 @@ static unsigned act(cref_policy *p, bool standing)
     }
     observe(p, command, obs);
     run_network(p, obs, action);
-    if (!are_finite(action, CREF_JOINTS))
+    if (!are_finite(action, CREF_JOINTS)) {
+        if (!p->aimed) /* there is no good target to hold */
+            memcpy(p->target, p->q, sizeof p->target);
         return status | CREF_BAD_ACTION;
+    }
     for (int j = 0; j < CREF_JOINTS; j++)
         p->action[j] = clip(action[j], -ACTION_CLIP, ACTION_CLIP);
     return status | aim(p);
@@ -166,7 +169,7 @@ void cref_reset(cref_policy *p)
 {
     memset(p, 0, sizeof *p);
     for (int j = 0; j < CREF_JOINTS; j++)
-        p->q[j] = p->first_q[j] = cref_joints[j].default_pose;
+        p->q[j] = p->first_q[j] = p->target[j] = cref_joints[j].default_pose;
     p->wait = CREF_START_AFTER;
 }
 
