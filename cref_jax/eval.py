@@ -39,7 +39,7 @@ from cref_jax.evaluation import (
 from cref_jax.evaluation.witness import Witness
 from cref_jax.pages import evaluation_page
 from cref_jax.physics.records import EngineName
-from cref_jax.policy import reader, sources, trained, writer
+from cref_jax.policy import learner_file, reader, sources, trained, writer
 from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain.generators import KINDS
 from cref_jax.training import run_dir
@@ -217,8 +217,8 @@ def _film(subject: Subject, options: Options, out: Path) -> None:
 
 @contextlib.contextmanager
 def _export_subject(subject: Subject) -> Iterator[Path]:
-    """Yield the policy as an exported one; a run's is exported to a temporary folder."""
-    if not sources.is_run(subject.source):
+    """Yield the policy as an exported one; one in training is exported to a temporary folder."""
+    if not (sources.is_run(subject.source) or learner_file.is_learner(subject.source)):
         yield subject.source
         return
     with tempfile.TemporaryDirectory() as folder:

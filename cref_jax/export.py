@@ -35,6 +35,8 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare()
         if not options.out.name:
             raise ConfigError(f"--out must be a folder with a name, not {options.out}")
+        if options.learner and options.policy:
+            raise ConfigError("--learner goes with --run: an exported policy has no critic")
         if options.learner:
             out = cli.prepare_output(options.learner, ".npz", "--learner")
             _write_learner(_resolve_run(options), out)

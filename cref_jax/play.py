@@ -177,7 +177,7 @@ def drive(options: Options) -> None:
         raise ConfigError("--live goes without --agent, --stills and --out")
     if options.scene and (options.terrain or options.kind or options.level is not None):
         raise ConfigError("--scene goes without --terrain, --kind and --level")
-    source = sources.resolve_policy(options.run, options.policy)
+    source = sources.resolve_policy(options.run, options.policy, options.robot)
     c = sources.read_config(source)
     terrain = options.terrain or c.terrain.name
     if options.scene:

@@ -54,8 +54,9 @@ class Options(cli.DebugOption):
     """number of trials, each of up to 40 s"""
     seed: Annotated[int, limits.SEED] = 0
     """seed of initial states and commands, the same as in `eval --suite cross`"""
-    latency: Annotated[float, Within(0, 10)] = 0.02
-    """s from the exposure of a frame until the policy has it"""
+    latency: Annotated[float, Within(Config().physics.control_period, 10)] = 0.02
+    """s from the exposure of a frame until the policy has it, in whole control steps: a frame comes
+    with the next step at the earliest"""
     randomised: bool = False
     """vary the robot in each trial, with sensor noise, pushes and faults of the camera, as
     `eval --suite robust` does"""
@@ -160,7 +161,7 @@ class _Walker:
         self._contents = deploy.contents(path)
         joints = deploy.Policy(*self._contents).joints.names
         self._bodies = [WholeBodySim(c, lane, joints) for lane in lanes]
-        self._late = max(0, round(options.latency / c.physics.control_period))
+        self._late = max(1, round(options.latency / c.physics.control_period))
         self._config, self._options = protocol.randomise(c), options
 
     def __call__(self, job: tuple[Start, int, int]) -> Trial:
@@ -185,7 +186,7 @@ def summarize(trials: list[Trial], options: Options) -> LaneResult:
         trials=len(trials),
         successes=causes.pop("finished", 0),
         by_cause=dict(causes),
-        seconds=float(np.mean(seconds)) if seconds else float("nan"),
+        seconds=float(np.mean(seconds)) if seconds else None,
         speed=float(np.mean([trial.speed for trial in trials])),
     )
 

@@ -81,6 +81,16 @@ def test_the_scenes_are_walked_by_the_runtime(tmp_path, monkeypatch, capsys):
     assert record["policies"][0]["name"] == bundled.name
 
 
+def test_what_was_learned_in_one_file_is_exported_for_the_runtime(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(eval.writer, "write", lambda policy, world, path: written.append(path))
+    policy = reader.read(sources.bundled_policy())
+    for source in (Path("learned.npz"), sources.bundled_policy(), Path("policy.zip")):
+        with eval._export_subject(eval.Subject(source, policy, None)) as path:
+            assert (path == source) == (source.suffix != ".npz")
+    assert [path.name for path in written] == ["policy"]
+
+
 @pytest.mark.slow
 def test_the_table_of_the_bundled_policy(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(protocol, "robots_per_block", lambda: 2)

@@ -69,6 +69,7 @@ def test_a_mistake_is_one_line(capsys, monkeypatch, tmp_path, arguments, said):
         (["--scene", "curbs", "--kind", "gap"], "--scene goes without --terrain, --kind"),
         (["--scene", "curbs", "--port", "0"], "--port must be 1 to 65535"),
         (["--policy", "robst"], "no run or policy robst"),
+        (["--robot", "g1"], "is of the robot 'x2_ultra', not of 'g1'"),
     ],
 )
 def test_a_mistake_of_a_live_page_is_one_line(capsys, arguments, said):

@@ -1,5 +1,6 @@
 """Command tracking on level ground: standing, walking, turning and stopping."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +29,10 @@ GRID = (  # m/s forward, m/s to the left, rad/s to the left
 STOP = (0.6, 0.0, 0.0)  # before the command to stop
 WALKS = 5.0  # s of walking before that command; assumed
 DRIFT = 0.05  # m that a standing robot may move; assumed
+LANE = 16.0
+"""m, at least: at the lane's end a robot is put back. The fastest command, for `SECONDS` and by
+30 % too fast, takes 13 m; a robot starts up to 1 m from one end, and 1 m before the other it is
+there."""
 
 
 class CommandTrace(NamedTuple):
@@ -87,8 +92,8 @@ def summarize_command(
 
 def summarize_stop(trace: CommandTrace, period: float) -> dict[str, Any]:
     """Compute the distance from the command to stop until the end of the trial, m."""
-    first, upright = round(WALKS / period), ~trace.fallen[-1]
-    distance = np.linalg.norm(trace.position[-1] - trace.position[first], axis=-1)[upright]
+    last, upright = round(WALKS / period) - 1, ~trace.fallen[-1]  # step before that command
+    distance = np.linalg.norm(trace.position[-1] - trace.position[last], axis=-1)[upright]
     return {
         "trials": int(upright.size),
         "fell": int((~upright).sum()),
@@ -125,7 +130,8 @@ def describe(result: dict[str, Any]) -> str:
 
 def _flat_world(c: Config, physics: Physics) -> World:
     """Build a world with a flat lane on which no command is sampled."""
-    flat = lanes.build_grid(c.terrain, {"flat": (0.0,)}, (1,))
+    terrain = dataclasses.replace(c.terrain, lane_length=max(LANE, c.terrain.lane_length))
+    flat = lanes.build_grid(terrain, {"flat": (0.0,)}, (1,))
     return make_world(protocol.trial_config(c), physics).replace(lanes=flat)
 
 

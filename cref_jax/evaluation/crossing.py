@@ -25,7 +25,7 @@ class LaneResult(NamedTuple):
     trials: int
     successes: int  # reached the lane's end in time
     by_cause: dict[str, int]  # of the failures
-    seconds: float  # mean time of a success
+    seconds: float | None  # mean time of a success, None without any
     speed: float  # m/s forward, mean over the trials
     sideways: dict[str, float] | None = None
     """m, see lateral_drift.summarize; None in the whole-robot simulator"""
@@ -36,7 +36,7 @@ class LaneResult(NamedTuple):
         return (
             f"{self.kind} {generators.format_size(self.kind, self.size_m)}: {self.successes} of "
             f"{self.trials} trials crossed, "
-            + (f"{self.seconds:.1f} s each, " if self.successes else "")
+            + ("" if self.seconds is None else f"{self.seconds:.1f} s each, ")
             + f"{self.speed:.2f} m/s"
             + (f"; failures: {causes}" if causes else "")
         )
@@ -70,7 +70,7 @@ def cross(
         trials=count,
         successes=int(succeeded.sum()),
         by_cause=outcomes.failures(),
-        seconds=float(outcomes.seconds[succeeded].mean()) if succeeded.any() else float("nan"),
+        seconds=float(outcomes.seconds[succeeded].mean()) if succeeded.any() else None,
         speed=float(outcomes.forward.mean()),
         sideways=lateral_drift.summarize(outcomes.drift, outcomes.aside),
     )

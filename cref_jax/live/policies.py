@@ -8,6 +8,7 @@ import numpy as np
 from cref_jax import deploy, robot
 from cref_jax.config import Config, folders
 from cref_jax.env.world import World, build_world
+from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, reader, sources
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
@@ -42,7 +43,12 @@ def load(source: Path, world: World | None = None) -> Loaded:
     name = path.name if is_bundled else str(source)
     if path.exists() and (sources.is_run(path) or learner_file.is_learner(path)):
         world = world or build_world(sources.read_config(path), "mujoco")
-        return from_training(name, sources.load(path, world))
+        loaded = from_training(name, sources.load(path, world))
+        try:
+            loaded.runtime()
+        except deploy.PolicyFormatError as error:  # it has no network of this variant
+            raise ConfigError(f"{source}: {error}") from None
+        return loaded
     c = sources.read_config(path)
     return Loaded(name, "", c, *reader.read_contents(path))
 

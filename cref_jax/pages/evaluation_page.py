@@ -279,7 +279,7 @@ def _condition_table(conditions: Sequence[Record]) -> Html:
 def _plain_body(record: Record) -> Html:
     """Build the list of values and failure causes of a record without cells."""
     values = [(name, f"{_value(record[k])}{u}") for k, (name, u) in PLAIN.items() if k in record]
-    if record.get("suite") == "cross" and "seconds" in record:
+    if record.get("suite") == "cross" and record.get("successes") and "seconds" in record:
         values.append(("mean time per success", f"{_value(record['seconds'])} s"))
     causes = record.get("by_cause") or {}
     values += [(f"failures: {display_name(cause)}", str(count)) for cause, count in causes.items()]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cref_jax import config
 from cref_jax.evaluation import command_suite
 from cref_jax.evaluation.command_suite import CommandTrace
 
@@ -53,9 +54,18 @@ def test_the_error_is_that_of_the_mean_velocity_after_2_s():
 
 def test_a_robot_stops_where_it_is_at_the_end():
     # 0.6 m/s until 0.5 s after it is told to stop at 5 s: 30 cm
-    speed = np.where(np.arange(STEPS) <= 275, 0.6, 0.0)
+    speed = np.where(np.arange(STEPS) < 275, 0.6, 0.0)  # in steps of which the 250th is the first
     found = command_suite.summarize_stop(trace(speed), PERIOD)
     assert found["distance_m"] == pytest.approx(0.3, abs=1e-9) and found["fell"] == 0
+
+
+@pytest.mark.parametrize(("asked", "length"), [(8.0, 16.0), (20.0, 20.0)])
+def test_nobody_comes_to_the_lanes_end_in_a_trial(world, asked, length):
+    c = config.override(world.config, {"terrain": {"lane_length": asked}})
+    flat = command_suite._flat_world(c, world.physics)
+    assert flat.lanes.length == pytest.approx(length)
+    fastest = 1.3 * max(vx for vx, _, _ in command_suite.GRID) * command_suite.SECONDS
+    assert 1.0 + fastest < flat.lanes.end - flat.config.episode.lane_end
 
 
 def test_when_all_have_fallen_there_are_no_numbers():

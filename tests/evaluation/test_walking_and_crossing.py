@@ -1,12 +1,18 @@
 """How episodes are counted, with outcomes that are known beforehand."""
 
+import json
+
 import numpy as np
 import pytest
+from tiny_policy import policy
 
+from cref_jax import sim2sim
 from cref_jax.config import Config, override
+from cref_jax.deploy import Status
 from cref_jax.env.state import Ending
-from cref_jax.evaluation import crossing, protocol, walking
+from cref_jax.evaluation import crossing, protocol, trials, walking
 from cref_jax.evaluation.walking import _EpisodeStep, _summarize
+from cref_jax.whole_body.trial import Trial
 
 
 def trace(alive: np.ndarray, error: float, airborne: np.ndarray) -> _EpisodeStep:
@@ -109,3 +115,19 @@ def test_a_size_is_said_in_its_unit(kind, size, begin):
     outcome = crossing.LaneResult(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
     assert outcome.line().startswith(begin)
     assert outcome.line().endswith("failures: 1 low")
+
+
+def test_where_nobody_succeeds_there_is_no_time_and_the_record_is_json(world, monkeypatch):
+    number = np.full(3, 0.5)
+    fell = np.full(3, trials.ENDINGS.index("low"))
+    outcomes = trials.Trials(number, fell, number, number, number, number)
+    monkeypatch.setattr(crossing.trials, "run", lambda *_: outcomes)
+    monkeypatch.setattr(crossing, "crossing_world", lambda *_: world)
+    trial = Trial("low", 2.0, 0.3, 0.5, Status.OK, np.zeros((1, 7)))
+    options = sim2sim.Options(kind="gap", size=0.3)
+    for result in (
+        crossing.cross(world.config, world.physics, policy("blind").train, "gap", 0.3, 3),
+        sim2sim.summarize([trial] * 3, options),
+    ):
+        assert json.loads(json.dumps(result._asdict(), allow_nan=False))["seconds"] is None
+        assert result.line().startswith("gap 30 cm: 0 of 3 trials crossed, 0.50 m/s; failures: 3")

@@ -5,7 +5,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from tiny_policy import policy
 
+from cref_jax import config
 from cref_jax.config import folders
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import crossing, protocol, scene_suite, whole_robot
@@ -216,6 +218,15 @@ def test_a_newer_state_of_the_policy_walks_from_the_next_start_on():
     s.reset()
     view = steps(s, 5)
     assert (view.stage.policy.name, view.stage.policy.detail) == ("robust", "iteration 7")
+
+
+def test_a_run_that_the_runtime_has_no_network_for_is_one_line(world, tmp_path, monkeypatch):
+    full = policy("full")
+    c = config.override(full.config, {"network": {"variant": "hpl_teacher"}})
+    teacher = full._replace(config=c)
+    monkeypatch.setattr(policies.sources, "load", lambda *_: teacher)
+    with pytest.raises(ConfigError, match=r"network\.variant must be .*, not 'hpl_teacher'"):
+        policies.load(tmp_path, world)
 
 
 def test_a_film_holds_every_second_step_until_it_ends():

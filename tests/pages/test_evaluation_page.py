@@ -161,8 +161,15 @@ def test_the_records_of_one_kind_are_shown(tmp_path):
     pooled = {"wilson_low": 0.957, "wilson_high": 0.995, "fell_by_policy": [0, 3]}
     walk = written(eval_records.WALK | pooled, tmp_path).text
     assert "a fall (95 % interval 95.7 to 99.5 %)" in walk and "of them, by policy0, 3" in walk
-    cross = written(eval_records.CROSS | {"seconds": float("nan")}, tmp_path).text
+    cross = written(eval_records.CROSS, tmp_path).text
     assert "Crossing obstacles: gap, 30 cm" in cross and "95.5 %of 200 trials" in cross
+    assert "mean time per success20.1 s" in cross
+
+
+@pytest.mark.parametrize("seconds", [None, float("nan")])  # as written today, and before
+def test_where_nobody_succeeds_no_time_is_shown(tmp_path, seconds):
+    cross = written(eval_records.CROSS | {"successes": 0, "seconds": seconds}, tmp_path).text
+    assert "0.0 %of 200 trials" in cross and "time per success" not in cross
 
 
 @pytest.mark.parametrize(

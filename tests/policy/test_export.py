@@ -165,6 +165,15 @@ def test_every_command_refuses_another_robots_policy(command, capsys):
     assert "is of the robot 'x2_ultra', not of 'g1'" in said
 
 
+def test_what_was_learned_is_not_in_an_exported_policy(capsys, tmp_path):
+    with pytest.raises(SystemExit) as end:
+        export.main(["--policy", "robust", "--learner", str(tmp_path / "learned.npz")])
+    assert end.value.code == 2 and not list(tmp_path.iterdir())
+    assert capsys.readouterr().err == (
+        "error: --learner goes with --run: an exported policy has no critic\n"
+    )
+
+
 def test_a_policy_in_the_world_of_another_robot_is_refused(small_world):
     c = robot.fill_in(dataclasses.replace(small_world.config, robot=config.Robot("g1")))
     with pytest.raises(ConfigError, match="is of the robot 'x2_ultra', not of 'g1'"):
