@@ -20,7 +20,7 @@ class Clock:
         self._lock = threading.Lock()
         self._done: collections.deque[float] = collections.deque()  # s, wall time of each step
         self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
-        self.failure: Exception | None = None  # that ended the stepping
+        self.failure: Exception | None = None  # of the newest step
 
     def start(self) -> None:
         """Begin to step."""
@@ -35,6 +35,7 @@ class Clock:
         """Pause and make one control step."""
         self.paused = True
         self._session.step()
+        self.failure = None
 
     @property
     def share(self) -> float:
@@ -57,6 +58,7 @@ class Clock:
                 continue
             try:
                 self._session.step()
+                self.failure = None
             except Exception as error:
                 self.failure, self.paused = error, True
                 continue

@@ -38,7 +38,8 @@ class DrivePanel:
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock) -> None:
         self._gui, self._session, self._clock = server.gui, session, clock
-        self._lock, self._pressed = threading.Lock(), 0.0
+        self._lock = threading.Lock()
+        self._pressed: dict[str, float] = {}  # s, when each key was last acted on
         with self._gui.add_folder("Drive"):
             self._add_drive()
         with self._gui.add_folder("Push"):
@@ -131,15 +132,15 @@ class DrivePanel:
         ]
         for key, label, act in keys:
             command = self._gui.add_command(label, hotkey=key)
-            command.on_trigger(lambda _, act=act: self._press(act))
+            command.on_trigger(lambda _, key=key, act=act: self._press(key, act))
 
-    def _press(self, act: Callable[[], None]) -> None:
+    def _press(self, key: str, act: Callable[[], None]) -> None:
         """Act on a key, but not on every repeat of one that is held."""
         with self._lock:
             now = time.perf_counter()
-            if now - self._pressed < KEY_PERIOD:
+            if now - self._pressed.get(key, -math.inf) < KEY_PERIOD:
                 return
-            self._pressed = now
+            self._pressed[key] = now
         act()
 
     def _change(self, forward: float, turn: float) -> None:

@@ -24,6 +24,11 @@ class Loaded(NamedTuple):
     manifest: dict[str, Any]
     arrays: dict[str, np.ndarray]
 
+    @property
+    def iteration(self) -> int:
+        """How long it was trained."""
+        return self.manifest["provenance"]["iteration"]
+
     def runtime(self) -> deploy.Policy:
         """Create the policy in its reset state."""
         return deploy.Policy(self.manifest, dict(self.arrays))

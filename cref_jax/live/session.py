@@ -71,13 +71,17 @@ class Session:
         self.restarts = True  # by itself, after an end
         self._count = 0  # episodes so far
         self._film: Film | None = None
+        self._next_policy: Loaded | None = None
         self.begin(stage)
 
     def begin(self, stage: Stage) -> None:
-        """Go to another stage, to its first start."""
+        """Go to another stage, to its first start, with the newest state of its policy."""
         with self._lock:
-            self._stage, self._policy, self._number = stage, stage.policy.runtime(), 0
-            self._next_policy: Loaded | None = None
+            policy = stage.policy
+            if self._next_policy and self._next_policy.name == policy.name:
+                policy = max(self._next_policy, policy, key=lambda known: known.iteration)
+            self._stage, self._policy = stage._replace(policy=policy), policy.runtime()
+            self._next_policy, self._number = None, 0
             self._place_robot()
 
     def reset(self) -> None:
@@ -89,11 +93,13 @@ class Session:
                 self._policy, self._next_policy = self._next_policy.runtime(), None
             self._place_robot()
 
-    def take_policy(self, policy: Loaded) -> None:
-        """Walk with a newer state of the same policy from the next start on."""
+    def take_policy(self, policy: Loaded) -> bool:
+        """Walk with a newer state of the policy from the next start on; False if another walks."""
         with self._lock:
-            if policy.name == self._stage.policy.name:
+            is_same = policy.name == self._stage.policy.name
+            if is_same:
                 self._next_policy = policy
+            return is_same
 
     def drive(self, wish: Wish) -> None:
         """Ask for speeds from now on."""
@@ -155,11 +161,13 @@ class Session:
                 return
             episode.state.qvel[:2] += self._push
             self._push = np.zeros(2)
-            ending = episode.step(self._command())
+            command = self._command()
+            ending = episode.step(command)
             self._feet.update(episode.state, episode.force)
             self._gates.append(self._policy.tensors()["gate"])
             self._take_picture()
-            self._note = NOTES.get(ending or "", "")
+            stands = self._is_stopped or abs(command[0]) < episode.body.config.reward.standing
+            self._note = "" if stands and ending == "stalled" else NOTES.get(ending or "", "")
             if self._ending:
                 self._steps_left -= 1
             elif ending in OVER:

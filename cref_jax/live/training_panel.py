@@ -12,6 +12,7 @@ from viser import uplot
 from cref_jax.env.world import build_world
 from cref_jax.errors import CheckpointError, ConfigError
 from cref_jax.live import policies
+from cref_jax.live.policies import Loaded
 from cref_jax.live.session import Session
 from cref_jax.pages import training_log
 from cref_jax.training import run_dir
@@ -57,20 +58,27 @@ class TrainingPanel:
 
     def _watch(self) -> None:
         world = build_world(run_dir.read_config(self._run), "mujoco")
-        taken, wait = None, threading.Event()
+        known, wait = None, threading.Event()
+        policy: Loaded | None = None  # that does not walk yet
         with run_dir.checkpoints(self._run) as steps:
             while True:
                 newest = steps.latest()
                 try:
                     self._draw()
-                    if newest != taken:
-                        policy = policies.load(self._run, world)
-                        taken = newest
-                        self._session.take_policy(policy)
-                        self._said.content = f"{policy.detail} walks from the next start on"
+                    if newest != known:
+                        policy, known = policies.load(self._run, world), newest
+                    if policy and self._offer(policy):
+                        policy = None
                 except (CheckpointError, ConfigError) as error:
                     LOG.info("%s", error)  # it is being written or removed: look again
                 wait.wait(POLL)
+
+    def _offer(self, policy: Loaded) -> bool:
+        """Let the robot walk with a new checkpoint, unless another policy was chosen meanwhile."""
+        is_taken = self._session.take_policy(policy)
+        when = "walks from the next start on" if is_taken else "is there, but another policy walks"
+        self._said.content = f"{policy.detail} {when}"
+        return is_taken
 
     def _draw(self) -> None:
         log = training_log.read(self._run / "log.jsonl")

@@ -15,6 +15,7 @@ from cref_jax.live import drive_panel, server
 from cref_jax.live.server import Settings
 from cref_jax.live.session import Wish
 from cref_jax.live.stage import Place
+from cref_jax.live.training_panel import TrainingPanel
 
 CURBS = Settings(Path("robust"), Place(scene="curbs"))
 
@@ -85,6 +86,25 @@ def test_keys_change_what_is_asked_within_its_limits(page):
     assert session.wish == Wish(vx=1.0, yaw_rate=0.1, keep_lane=False)
     drive.refresh()
     assert (drive._forward.value, drive._turn.value, drive._lane.value) == (1.0, 0.1, False)
+
+
+def test_a_key_that_is_held_delays_no_other_key(page, monkeypatch):
+    """Two keys are held, and repeated every 30 ms: each acts at 0, 90 and 180 ms."""
+    drive, said = page[0]._drive, []
+    for k in range(7):
+        monkeypatch.setattr(drive_panel, "time", SimpleNamespace(perf_counter=lambda k=k: 0.03 * k))
+        for key in ("held", "other"):
+            drive._press(key, lambda key=key, k=k: said.append((30 * k, key)))
+    assert said == [(at, key) for at in (0, 90, 180) for key in ("held", "other")]
+
+
+def test_a_checkpoint_waits_while_another_policy_walks(page):
+    session, policy = page[0]._session, page[0]._session.view().stage.policy
+    panel = TrainingPanel(page[0]._sight.panel, page[0]._server, session, Path("runs/none"))
+    assert not panel._offer(policy._replace(name="runs/none", detail="iteration 3"))
+    assert panel._said.content == "iteration 3 is there, but another policy walks"
+    assert panel._offer(policy._replace(detail="iteration 4"))
+    assert panel._said.content == "iteration 4 walks from the next start on"
 
 
 def test_it_is_not_to_be_reached_from_elsewhere(page):

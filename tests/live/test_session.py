@@ -189,6 +189,29 @@ def test_a_paused_clock_makes_single_steps():
     assert s.view().seconds == pytest.approx(0.06)
 
 
+def test_a_failure_is_over_when_a_step_succeeds(monkeypatch):
+    s, fails = session(), [True, True]
+    whole = s.step
+    monkeypatch.setattr(s, "step", lambda: 1 / 0 if fails else whole())
+    clock = Clock(s)
+
+    def wait(until):
+        for _ in range(500):
+            if until():
+                return True
+            time.sleep(0.01)
+
+    clock.start()
+    assert wait(lambda: clock.failure) and clock.paused
+    fails.clear()
+    clock.paused = False
+    assert wait(lambda: clock.failure is None)
+    clock.stop()
+    clock.failure = ZeroDivisionError()
+    clock.step_once()
+    assert clock.failure is None
+
+
 def test_the_clock_says_how_fast_time_passed(monkeypatch):
     """Steps of 20 ms, one every 40 ms: half of real time."""
     clock = Clock(session())
@@ -218,6 +241,37 @@ def test_a_newer_state_of_the_policy_walks_from_the_next_start_on():
     s.reset()
     view = steps(s, 5)
     assert (view.stage.policy.name, view.stage.policy.detail) == ("robust", "iteration 7")
+
+
+def test_another_ground_is_walked_on_with_the_newest_state_of_the_policy():
+    def state(iteration):
+        origin = ROBUST.manifest["provenance"] | {"iteration": iteration}
+        manifest = ROBUST.manifest | {"provenance": origin}
+        return ROBUST._replace(detail=f"iteration {iteration}", manifest=manifest)
+
+    s = session(CURBS._replace(policy=state(1)))
+    walks = lambda: steps(s, 1).stage.policy.detail
+    assert s.take_policy(state(2))
+    s.begin(CURBS._replace(policy=state(1)))  # built while the newer one came
+    assert walks() == "iteration 2"
+    assert s.take_policy(state(3))
+    s.begin(CURBS._replace(policy=state(4)))  # read again from its folder
+    assert walks() == "iteration 4"
+    s.reset()
+    assert walks() == "iteration 4"
+    assert not s.take_policy(policies.load(Path("mixed")))
+
+
+@pytest.mark.parametrize(
+    ("wish", "note"), [(0.0, ""), (0.05, ""), (-0.05, ""), (0.5, "Hardly moves")]
+)
+def test_only_who_is_to_walk_hardly_moves(monkeypatch, wish, note):
+    s = session()
+    monkeypatch.setattr(s._episode, "step", lambda command: "stalled")
+    s.drive(Wish(wish))
+    assert steps(s, 1).note == note
+    s.stop()
+    assert steps(s, 1).note == ""
 
 
 def test_a_run_that_the_runtime_has_no_network_for_is_one_line(world, tmp_path, monkeypatch):
