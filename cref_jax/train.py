@@ -221,7 +221,9 @@ def _run_stages(
         state = _run_stage(taught, mesh, steps, report, options, stop)
     if stop.requested or int(state.train.iteration) < last:
         return state
-    report.say(f"the teacher is done after {trained.describe_samples(taught.config, last)}")
+    samples = trained.count_samples(taught.config, last)
+    said = trained.describe_samples(taught.config, last, samples)
+    report.say(f"the teacher is done after {said}")
     programs = _compile(world, mesh, report, options, last)
     state = iteration.start_student(world, state, mesh)
     return trainer.run_chunks(world, state, steps, report, programs)
@@ -258,10 +260,11 @@ def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Report
         return SilentReporter()
     run_dir.write_config(run, c)
     stages = distillation.samples_by_stage(c, first)
-    run_dir.write_origin(run, first, c.terrain.name, resolve_engine(options.engine), stages)
-    samples = c.run.num_envs * c.ppo.horizon
+    engine = resolve_engine(options.engine)
+    run_dir.write_origin(run, first, c.terrain.name, engine, stages, c.run.num_envs)
+    each, before = c.run.num_envs * c.ppo.horizon, run_dir.count_samples(run, c, first)
     wandb = dataclasses.asdict(c) if options.wandb else None
-    return Reporter(run, first, c.run.iterations, samples, options.tensorboard, wandb)
+    return Reporter(run, first, c.run.iterations, each, before, options.tensorboard, wandb)
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:
@@ -323,7 +326,8 @@ def _opening_lines(run: Path, c: Config, count: int, options: Options, first: in
 def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) -> None:
     """Print the samples of each stage, the evaluation and the next command."""
     if c.network.variant == "hpl":
-        print(f"trained for {trained.describe_samples(c, int(state.train.iteration))}")
+        done = int(state.train.iteration)
+        print(f"trained for {trained.describe_samples(c, done, trained.count_samples(c, done))}")
     if options.evaluate and int(state.train.iteration) >= c.run.iterations:
         print("evaluating 100 episodes on flat ground ...", flush=True)
         physics = build_physics(c, options.engine)

@@ -407,6 +407,9 @@ def test_a_run_goes_on_with_another_number_of_robots_and_keeps_what_it_learned(
     shutil.copytree(first, tmp_path / "run")
     run(tmp_path / "run", "--iterations", "3", "--num-envs", "4", "--resume")
     assert "num_envs changes from 8 to 4" in capsys.readouterr().out
+    c, log = run_dir.read_config(first), (tmp_path / "run" / "log.jsonl").read_text().splitlines()
+    samples = [json.loads(line)["train/samples"] / c.ppo.horizon for line in log]
+    assert samples == [8, 16, 20]  # two iterations of eight robots, one of four
     with Checkpoints(tmp_path / "run" / "checkpoints") as steps:
         assert steps.latest() == 3
 

@@ -13,10 +13,10 @@ import numpy as np
 from cref_jax.config import Config, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
-from cref_jax.policy.trained import TrainedPolicy, learner_shapes
+from cref_jax.policy.trained import TrainedPolicy, count_samples, learner_shapes
 from cref_jax.training import pytree_digest
 
-_SETTINGS, _ITERATION = "settings", "iterations"  # not the name of any leaf
+_SETTINGS, _ITERATION, _SAMPLES = "settings", "iterations", "samples"  # not the name of any leaf
 
 
 def is_learner(path: Path) -> bool:
@@ -33,6 +33,7 @@ def write(policy: TrainedPolicy, out: Path) -> None:
     arrays = pytree_digest.on_host(policy.train)
     arrays[_SETTINGS] = np.array(json.dumps(dataclasses.asdict(policy.config)))
     arrays[_ITERATION] = np.array(policy.iteration)
+    arrays[_SAMPLES] = np.array(policy.samples)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with out.open("wb") as file:
@@ -55,13 +56,18 @@ def read_config(path: Path) -> Config:
     return presets.apply_table(Config(), settings, path)
 
 
-def read_iteration(path: Path) -> int:
-    """Read how many iterations it was trained for.
+def read_length(path: Path) -> tuple[int, int]:
+    """Read for how many iterations and samples it was trained.
 
     Raises:
         ConfigError: it is not a learner file.
     """
-    return int(_load_arrays(path)[_ITERATION])
+    return _length(_load_arrays(path), read_config(path))
+
+
+def _length(arrays: dict[str, np.ndarray], c: Config) -> tuple[int, int]:
+    iteration = int(arrays[_ITERATION])
+    return iteration, int(arrays.get(_SAMPLES, count_samples(c, iteration)))
 
 
 def read(path: Path, world: World) -> TrainedPolicy:
@@ -76,7 +82,8 @@ def read(path: Path, world: World) -> TrainedPolicy:
         if name not in arrays or arrays[name].shape != leaf.shape:
             raise ConfigError(f"{path} does not fit these settings: {name} is not {leaf.shape}")
     placed = {name: jax.numpy.asarray(x) for name, x in arrays.items() if name != _SETTINGS}
-    return TrainedPolicy(c, pytree_digest.fill_from(like, placed), int(arrays[_ITERATION]), path)
+    iteration, samples = _length(arrays, c)
+    return TrainedPolicy(c, pytree_digest.fill_from(like, placed), iteration, path, samples)
 
 
 def _load_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -37,7 +37,8 @@ def read(path: Path, world: World | None = None) -> TrainedPolicy:
         params=train.params._replace(actor=actor),
         statistics=train.statistics._replace(obs=obs),
     )
-    return TrainedPolicy(c, train, content["provenance"]["iteration"], path)
+    provenance = content["provenance"]
+    return TrainedPolicy(c, train, provenance["iteration"], path, provenance["samples"])
 
 
 def policy_digest(policy: TrainedPolicy) -> str:

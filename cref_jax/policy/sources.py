@@ -87,7 +87,7 @@ def read_config(path: Path) -> Config:
 
 def describe(path: Path, policy: TrainedPolicy) -> str:
     """Say in one line which policy it is, and what it was trained on for how long."""
-    return _line(path, policy.config, policy.iteration)
+    return _line(path, policy.config, policy.iteration, policy.samples)
 
 
 def summarize(path: Path) -> str:
@@ -98,16 +98,18 @@ def summarize(path: Path) -> str:
     """
     c = read_config(path)
     if learner_file.is_learner(path):
-        return _line(path, c, learner_file.read_iteration(path))
+        return _line(path, c, *learner_file.read_length(path))
     if is_run(path):
-        return _line(path, c, run_dir.checkpoints(path).latest() or 0)
-    return _line(path, c, reader.read_contents(path)[0]["provenance"]["iteration"])
+        done = run_dir.checkpoints(path).latest() or 0
+        return _line(path, c, done, run_dir.count_samples(path, c, done))
+    provenance = reader.read_contents(path)[0]["provenance"]
+    return _line(path, c, provenance["iteration"], provenance["samples"])
 
 
-def _line(path: Path, c: Config, iteration: int) -> str:
+def _line(path: Path, c: Config, iteration: int, samples: int) -> str:
     sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
-    samples = describe_samples(c, iteration)
-    return f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {samples}"
+    length = describe_samples(c, iteration, samples)
+    return f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {length}"
 
 
 def load(path: Path, world: World) -> TrainedPolicy:

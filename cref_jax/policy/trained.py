@@ -20,21 +20,17 @@ class TrainedPolicy(NamedTuple):
     train: ppo.TrainState
     iteration: int
     run: Path
-
-    @property
-    def samples(self) -> int:
-        """Control steps of training experience."""
-        return count_samples(self.config, self.iteration)
+    samples: int  # control steps of training experience
 
 
 def count_samples(c: Config, iteration: int) -> int:
-    """Count the control steps of training experience in this many iterations."""
+    """Count the control steps of this many iterations, all with the robots of these settings."""
     return iteration * c.run.num_envs * c.ppo.horizon
 
 
-def describe_samples(c: Config, iteration: int) -> str:
+def describe_samples(c: Config, iteration: int, samples: int) -> str:
     """Say how many samples were seen, and by which stage of a run that has several."""
-    text = f"{count_samples(c, iteration) / 1e6:.1f} M samples"
+    text = f"{samples / 1e6:.1f} M samples"
     stages = distillation.samples_by_stage(c, iteration)
     each = ", ".join(f"{count / 1e6:.1f} M by the {name}" for name, count in stages.items())
     return f"{text} ({each})" if each else text
@@ -59,7 +55,8 @@ def load_policy(run: Path, world: World) -> TrainedPolicy:
                 "--resume"
             )
         train = steps.restore_part("train", like, newest)
-        return TrainedPolicy(c, with_averaged_actor(train), newest or 0, run)
+        samples = run_dir.count_samples(run, c, newest or 0)
+        return TrainedPolicy(c, with_averaged_actor(train), newest or 0, run, samples)
 
 
 def learner_shapes(c: Config, world: World) -> ppo.TrainState:

@@ -159,16 +159,14 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     state, losses, trace = sharded_learn(world, state, key)
     falls = trace.ending.terminated.mean() * (60.0 / c.physics.control_period)
     state = state.replace(ramp=randomization_ramp.update_ramp(state.ramp, falls, c.randomisation))
-    samples = count_samples(c, state.train.iteration)
     log = {
         **_episode_log(trace, world.lanes.kinds, c.physics.control_period),
         **{f"reward/{name}": term.mean() for name, term in trace.measures.terms.items()},
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
         "train/action_std": std.mean(),
-        "train/samples": samples,
         "train/randomisation": state.ramp.share,
-        **_stage_samples(c, samples),
+        **_stage_samples(c, state.train.iteration),
     }
     return state, jax.lax.with_sharding_constraint(log, NamedSharding(mesh, P()))
 
@@ -188,11 +186,6 @@ def _reinforce(
     return train, robots, losses, trace
 
 
-def count_samples(c: config.Config, iteration: Int[Array, ""]) -> Float[Array, ""]:
-    """Count the control steps of experience until an iteration; more than int32 holds."""
-    return iteration.astype(jnp.float32) * float(c.run.num_envs * c.ppo.horizon)
-
-
 def raise_deviations(train: ppo.TrainState, c: config.Network) -> ppo.TrainState:
     """Raise the actions' deviations to the least one: below it, they would get no gradient."""
     if c.min_std == 0.0:
@@ -202,13 +195,14 @@ def raise_deviations(train: ppo.TrainState, c: config.Network) -> ppo.TrainState
     return train.replace(params=train.params._replace(actor=raised))
 
 
-def _stage_samples(c: config.Config, samples: Float[Array, ""]) -> Log:
-    """Log the samples of teacher and student, in the second stage."""
-    stages = distillation.samples_by_stage(c, c.run.iterations)
-    if not stages:
+def _stage_samples(c: config.Config, iteration: Int[Array, ""]) -> Log:
+    """Log the samples of teacher and student, in the second stage; int32 holds too few of them."""
+    if c.network.variant != "hpl":
         return {}
-    of_teacher = jnp.float32(stages["teacher"])
-    return {"train/teacher_samples": of_teacher, "train/student_samples": samples - of_teacher}
+    each = float(c.run.num_envs * c.ppo.horizon)
+    last = distillation.teacher_config(c).run.iterations
+    of_student = (iteration - last).astype(jnp.float32) * each
+    return {"train/teacher_samples": jnp.float32(last * each), "train/student_samples": of_student}
 
 
 def partition(world: World) -> RunState:

@@ -42,18 +42,19 @@ class Reporter:
         first: int,
         last: int,
         samples: int,
+        before: int = 0,
         tensorboard: bool = True,
         wandb: Mapping[str, Any] | None = None,
     ) -> None:
-        """Report iterations `first` to `last`, of `samples` samples each.
+        """Report iterations `first` to `last`, of `samples` samples each, after those of `before`.
 
         `wandb` are the settings of the run that its log at Weights & Biases shows, if it has one.
         """
         self.console = Console()
-        self._file = (run / "log.jsonl").open("a", encoding="utf-8")
+        self._file = (run / "log.jsonl").open("a" if first else "w", encoding="utf-8")
         self._board = SummaryWriter(str(run / "tensorboard")) if tensorboard else None
         self._wandb = WandbLog(run, wandb, self.say) if wandb is not None else None
-        self._last, self._samples = last, samples
+        self._last, self._samples, self._before = last, samples, before - first * samples
         self._live: Live | None = None
         self._bar = Progress(
             TextColumn("iteration"),
@@ -98,14 +99,16 @@ class Reporter:
         count = len(next(iter(log.values())))
         rate = count * self._samples / seconds
         for i in range(count):
+            iteration = first + i + 1
             row = {name: float(values[i]) for name, values in log.items()}
-            line = {"iteration": first + i + 1, "samples_per_s": round(rate), **_round_row(row)}
+            row["train/samples"] = float(self._before + iteration * self._samples)
+            line = {"iteration": iteration, "samples_per_s": round(rate), **_round_row(row)}
             self._file.write(json.dumps(line) + "\n")
             if self._board:
                 for name, value in row.items():
-                    self._board.add_scalar(name, value, first + i + 1)
+                    self._board.add_scalar(name, value, iteration)
             if self._wandb:
-                self._wandb.log(row, first + i + 1)
+                self._wandb.log(row, iteration)
         self._file.flush()
         self._show(first + count, {name: float(v.mean()) for name, v in log.items()}, rate)
 

@@ -95,7 +95,8 @@ def check_settings(run: Path, own: Config, asked: Config) -> None:
     Raises:
         ConfigError: names each, with the run's value and the one asked for.
     """
-    fixed = [x for x in _find_differences(own, asked) if x[0] not in MAY_CHANGE]
+    may_change = [x for x in MAY_CHANGE if x != "run.num_envs" or own.network.variant != "hpl"]
+    fixed = [x for x in _find_differences(own, asked) if x[0] not in may_change]
     if fixed:
         each = "; ".join(f"{_option(name)} {old}, not {new}" for name, old, new in fixed)
         raise ConfigError(

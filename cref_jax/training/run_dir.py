@@ -35,8 +35,10 @@ ROOT = Path("runs")
 
 
 def write_config(run: Path, c: Config) -> None:
-    """Write all settings of the run."""
-    (run / "config.json").write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+    """Write all settings of the run; the file before stays until this one is whole."""
+    part = run / "config.json.part"
+    part.write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+    part.replace(run / "config.json")
 
 
 def write_origin(
@@ -45,15 +47,18 @@ def write_origin(
     terrain: str = "",
     engine: str = "",
     samples: Mapping[str, int] | None = None,
+    num_envs: int | None = None,
 ) -> None:
     """Append a line with the origin of this start: versions, device, command and git state.
 
     `iteration` is the number of iterations done before it, `terrain` a name or a map's file,
-    `samples` those done by each stage of a run that has several.
+    `samples` those done by each stage of a run that has several, `num_envs` the robots from here
+    on. Starts without an iteration done are forgotten: nothing of theirs is left.
     """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "iteration": iteration,
+        **({"num_envs": num_envs} if num_envs else {}),
         **({"samples": dict(samples)} if samples else {}),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         "python": platform.python_version(),
@@ -63,7 +68,7 @@ def write_origin(
         **({"map": map_files.digest(Path(terrain))} if map_files.is_map(terrain) else {}),
         **versions(),
     }
-    with (run / "origin.jsonl").open("a") as file:
+    with (run / "origin.jsonl").open("a" if iteration else "w") as file:
         file.write(json.dumps(line) + "\n")
 
 
@@ -114,11 +119,30 @@ def last_engine(run: Path) -> str | None:
     return _read_origin(run, -1).get("engine")
 
 
+def count_samples(run: Path, c: Config, iteration: int) -> int:
+    """Count the control steps of experience in a run's first iterations.
+
+    A run that goes on may do so with another number of robots; a start that goes on from before an
+    earlier one replaces what that one did.
+    """
+    starts = [(s.get("iteration", 0), s.get("num_envs", c.run.num_envs)) for s in _read_starts(run)]
+    samples, end = 0, iteration
+    for first, num_envs in reversed([(0, c.run.num_envs), *starts]):
+        samples += max(end - first, 0) * num_envs * c.ppo.horizon
+        end = min(end, first)
+    return samples
+
+
+def _read_starts(run: Path) -> list[dict[str, Any]]:
+    starts: list[dict[str, Any]] = []
+    with contextlib.suppress(OSError, ValueError):  # up to a line that was cut short
+        for line in (run / "origin.jsonl").read_text().splitlines():
+            starts.append(json.loads(line))
+    return starts
+
+
 def _read_origin(run: Path, start: int) -> dict[str, Any]:
-    try:
-        return json.loads((run / "origin.jsonl").read_text().splitlines()[start])
-    except (OSError, ValueError, IndexError):
-        return {}
+    return next(iter(_read_starts(run)[start:]), {})
 
 
 def first_option(run: Path, name: str) -> str | None:

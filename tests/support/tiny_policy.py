@@ -54,7 +54,7 @@ def policy(
     mean, std = 0.2 * jax.random.normal(key, (OBS,)), jnp.linspace(0.2, 2.0, OBS)
     obs = train.statistics.obs.replace(mean=mean, std=std)
     train = train.replace(statistics=train.statistics._replace(obs=obs))
-    return trained.TrainedPolicy(c, train, 7, Path("runs/none"))
+    return trained.TrainedPolicy(c, train, 7, Path("runs/none"), trained.count_samples(c, 7))
 
 
 def contents(p: trained.TrainedPolicy) -> tuple[dict, dict[str, np.ndarray]]:

@@ -168,8 +168,7 @@ def test_lessons_teach_the_student_alone():
         old = jax.tree.leaves(before.params.actor["params"][name])
         moved = [np.abs(a - b).max() for a, b in zip(old, jax.tree.leaves(part), strict=True)]
         assert (min(moved) > 0.0) == (name != "log_std"), name
-    np.testing.assert_allclose(log["train/samples"], [48, 72])  # of 4 robots in 6 steps
-    np.testing.assert_allclose(log["train/teacher_samples"], [24, 24])
+    np.testing.assert_allclose(log["train/teacher_samples"], [24, 24])  # of 4 robots in 6 steps
     np.testing.assert_allclose(log["train/student_samples"], [24, 48])
     assert np.all(np.asarray(log["loss/imitation"]) > 0.0)
     assert world.config.distillation.learning_rate == pytest.approx(3e-4)

@@ -5,8 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from cref_jax.config import Config
 from cref_jax.errors import ConfigError
 from cref_jax.training import run_dir
+
+C = Config()  # 4096 robots, a horizon of 24 steps
 
 
 @pytest.fixture
@@ -67,9 +70,38 @@ def test_a_folder_that_cannot_be_written_is_named_and_nothing_is_made(tmp_path, 
 
 def test_the_engine_of_the_last_start_is_remembered(tmp_path):
     assert run_dir.last_engine(tmp_path) is None
-    for engine in ("mujoco", "warp"):
-        run_dir.write_origin(tmp_path, engine=engine)
+    for iteration, engine in enumerate(("mujoco", "warp")):
+        run_dir.write_origin(tmp_path, iteration, engine=engine)
     assert run_dir.last_engine(tmp_path) == "warp"
+
+
+def test_samples_are_counted_by_the_robots_of_each_start(tmp_path):
+    count = lambda iteration: run_dir.count_samples(tmp_path, C, iteration)
+    assert count(10) == 10 * 4096 * 24  # no start is known: the settings' robots
+    run_dir.write_origin(tmp_path, 0, num_envs=100)
+    run_dir.write_origin(tmp_path, 30, num_envs=10)
+    run_dir.write_origin(tmp_path, 20, num_envs=1)  # from an older checkpoint: 20 to 30 anew
+    assert count(20) == 20 * 100 * 24
+    assert count(50) == (20 * 100 + 30 * 1) * 24
+
+
+def test_a_start_that_came_to_no_iteration_is_forgotten(tmp_path):
+    run_dir.write_origin(tmp_path, 0, engine="mjx")
+    run_dir.write_origin(tmp_path, 0, engine="warp")
+    assert len((tmp_path / "origin.jsonl").read_text().splitlines()) == 1
+
+
+def test_settings_survive_a_full_disk(tmp_path, monkeypatch):
+    run_dir.write_config(tmp_path, C)
+
+    def fill_up(path, text):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(run_dir.Path, "write_text", fill_up)
+    with pytest.raises(OSError, match="No space left"):
+        run_dir.write_config(tmp_path, C)
+    assert run_dir.read_config(tmp_path) == C
 
 
 def test_a_run_without_a_first_command_gave_no_option(tmp_path):
