@@ -121,9 +121,10 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(run):
 
 def test_the_newest_evaluation_of_each_suite_is_shown(run):
     (run / "checkpoints" / "40").mkdir(parents=True)
-    files = {"eval_old.json": eval_records.CROSS | {"successes": 11, "iteration": 20}}
+    policies = [{"name": "run", "iteration": 35}, {"name": "run", "iteration": 30}]
+    files = {"eval_old.json": eval_records.CROSS | {"successes": 11, "policies": policies}}
     files |= {
-        "eval.json": eval_records.CROSS | {"iteration": 30},
+        "eval.json": eval_records.CROSS | {"policies": policies},
         "eval_table.json": eval_records.table(3),
     }
     for age, (name, record) in enumerate(files.items()):

@@ -136,11 +136,18 @@ def evaluation_body(
         shown = [evaluation_page.lead(record), markup.subsections(sections)]
     except ConfigError as error:
         return note(code(source), f": {error}.")
-    measured = record.get("iteration")
-    if iteration is not None and isinstance(measured, int) and measured < iteration:
+    measured = _measured_iteration(record)
+    if iteration is not None and measured is not None and measured < iteration:
         text = f"Measured at iteration {measured:,}; the latest checkpoint is {iteration:,}."
         shown.insert(0, note(text))
     return join(*shown)
+
+
+def _measured_iteration(record: Mapping[str, Any]) -> int | None:
+    """Find the iteration of an evaluation's policy, the least of several; None if unknown."""
+    of = (record, *(record.get("policies") or ()))
+    found = (part.get("iteration") for part in of)
+    return min((number for number in found if isinstance(number, int)), default=None)
 
 
 def format_time(iso: Any) -> str:

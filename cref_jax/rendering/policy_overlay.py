@@ -41,7 +41,7 @@ def draw(view: PolicyView, height: int, d_max: float, period: float, sees: bool)
         top += TITLE + size[1] + MARGIN
         pen.text((MARGIN, top), "attention, mean over heads", INK, font)
         size = (inner // 2, inner * 3 // 8)
-        picture.paste(_attention_image(view.attention, size), (MARGIN, top + TITLE))
+        picture.paste(_attention_image(view, size), (MARGIN, top + TITLE))
         top += TITLE + size[1] + MARGIN
     pen.text((MARGIN, top), "highway gate (1: memory)", INK, font)
     draw_gate(pen, view.gates, (MARGIN, top + TITLE, WIDTH - MARGIN, height - MARGIN), period)
@@ -56,12 +56,16 @@ def colour_depth(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) 
     return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
 
 
-def _attention_image(weights: Float[np.ndarray, " N"] | None, size: tuple[int, int]) -> Image.Image:
-    """Draw the token weights at their image positions, scaled to the largest."""
-    if weights is None:
+def _attention_image(view: PolicyView, size: tuple[int, int]) -> Image.Image:
+    """Draw the token weights at their image positions, scaled to the largest.
+
+    A token is of as many pixels down as across, so their grid has the proportions of the image.
+    """
+    if view.depth is None or view.attention is None:
         return Image.new("RGB", size, FAINT)
-    rows = round((len(weights) * 3 / 4) ** 0.5)
-    grid = (weights / weights.max()).reshape(rows, -1)
+    height, width = view.depth.shape
+    rows = round((len(view.attention) * height / width) ** 0.5)
+    grid = (view.attention / view.attention.max()).reshape(rows, -1)
     colours = matplotlib.colormaps["magma"](grid, bytes=True)
     return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
 

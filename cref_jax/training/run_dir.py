@@ -32,6 +32,7 @@ from cref_jax.terrain import map_files
 from cref_jax.training.checkpoint import Checkpoints
 
 ROOT = Path("runs")
+PROGRAM = ("cref_jax", "experiments", "terrains", "pyproject.toml")  # what decides a result
 
 
 def write_config(run: Path, c: Config) -> None:
@@ -183,6 +184,8 @@ def reserve(name: str) -> Path:
 def newest(root: Path = ROOT, robot: str | None = None) -> Path:
     """Find the run with the newest checkpoint, of this robot or of any.
 
+    A run whose settings cannot be read is left out where a robot is asked for.
+
     Raises:
         ConfigError: no run has one.
     """
@@ -190,7 +193,7 @@ def newest(root: Path = ROOT, robot: str | None = None) -> Path:
         path.parent for path in root.glob("*/checkpoints") if Checkpoints(path).latest() is not None
     ]
     if robot is not None:
-        runs = [run for run in runs if name_robot(read_config(run).robot.name) == robot]
+        runs = [run for run in runs if _robot_of(run) == robot]
     if not runs:
         whose, how = (f" of '{robot}'", f' ARGS="--robot {robot}"') if robot else ("", "")
         raise ConfigError(
@@ -199,18 +202,33 @@ def newest(root: Path = ROOT, robot: str | None = None) -> Path:
     return max(runs, key=lambda run: (run / "checkpoints").stat().st_mtime)
 
 
+def _robot_of(run: Path) -> str | None:
+    """Read the robot's name; None, and a line that says so, where the settings are unreadable."""
+    try:
+        return name_robot(read_config(run).robot.name)
+    except ConfigError as error:
+        print(f"{run} is left out: {error}", file=sys.stderr)
+        return None
+
+
 def checkpoints(run: Path, keep: int = 3) -> Checkpoints:
     """Open the checkpoints of a run."""
     return Checkpoints(run / "checkpoints", keep)
 
 
 def _git_state() -> str | None:
-    """Read the program's commit, with a "+" if there are uncommitted changes; None without git."""
+    """Read the program's commit, with a "+" if its own files have uncommitted changes.
+
+    None without git, and for an installed program, whatever repository it may lie below.
+    """
+    file = Path(__file__)
+    top = file.parents[2]
+    git = lambda *words: subprocess.run(
+        ["git", "-C", str(top), *words], capture_output=True, text=True, check=True
+    ).stdout.strip()
     try:
-        here = Path(__file__).parent
-        git = lambda *words: subprocess.run(
-            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain") else "")
+        git("ls-files", "--error-unmatch", str(file.relative_to(top)))
+        changes = git("status", "--porcelain", "--", *PROGRAM)
+        return git("rev-parse", "HEAD") + ("+" if changes else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -148,6 +148,16 @@ def test_the_newest_run_is_that_of_the_robot(tmp_path, monkeypatch):
         newest("g2")
 
 
+def test_a_run_that_cannot_be_read_hides_no_other_run(tmp_path, monkeypatch, capsys):
+    runs_of(tmp_path / "runs", a="g1", b="x2_ultra", c="g1")
+    (tmp_path / "runs" / "c" / "config.json").write_text("{")
+    monkeypatch.chdir(tmp_path)
+    for name, run in (("x2_ultra", "runs/b"), ("g1", "runs/a")):
+        assert sources.resolve_policy(None, None, name) == Path(run)
+        said = capsys.readouterr().err
+        assert said.startswith("runs/c is left out: runs/c/config.json") and said.count("\n") == 1
+
+
 def test_without_a_run_of_the_robot_its_training_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert sources.resolve_policy(None, None, "x2_ultra") == sources.bundled_policy()

@@ -50,6 +50,19 @@ def test_each_part_shows_what_it_is_given():
     assert rows["attention"].max() < rows["gates"].min()
 
 
+def test_the_attention_is_where_its_token_is_in_an_image_of_any_shape():
+    # 64 x 64 pixels in tokens of 8 x 8 are 8 x 8 tokens; the tenth is the second of the second row
+    weights = np.zeros(64)
+    weights[9] = 1.0
+    image = draw(some_view(depth=np.zeros((64, 64)), attention=weights)).astype(int)
+    wide, high = 148, 111  # pixels of the picture of the attention
+    top, left = 12 + 20 + 222 + 12 + 20, 12
+    part = image[top : top + high, left : left + wide].sum(axis=2)
+    down, across = np.nonzero(part == part.max())
+    np.testing.assert_allclose(down.mean() / high, 1.5 / 8, atol=0.02)
+    np.testing.assert_allclose(across.mean() / wide, 1.5 / 8, atol=0.02)
+
+
 def test_before_the_first_frame_it_is_grey_and_does_not_fail():
     image = draw(PolicyView(None, None, np.full((1, 16), 0.5)))
     assert (image[100, 100] == policy_overlay.FAINT).all()

@@ -1,6 +1,7 @@
 """A run remembers the map that it began on, and the command."""
 
 import json
+import subprocess
 
 import numpy as np
 import pytest
@@ -106,3 +107,35 @@ def test_settings_survive_a_full_disk(tmp_path, monkeypatch):
 
 def test_a_run_without_a_first_command_gave_no_option(tmp_path):
     assert run_dir.first_option(tmp_path, "experiment") is None
+
+
+@pytest.fixture
+def repository(tmp_path, monkeypatch):
+    """Return a repository of this program, whose one commit has the file that reads it."""
+    file = tmp_path / "cref_jax" / "training" / "run_dir.py"
+    file.parent.mkdir(parents=True)
+    file.touch()
+    monkeypatch.setattr(run_dir, "__file__", str(file))
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=A", "-c", "user.email=a@example.org"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "Begin"]):
+        subprocess.run([*git, *words], check=True)
+    return tmp_path
+
+
+def test_only_changes_of_the_programs_own_files_mark_its_commit(repository):
+    commit = run_dir._git_state()
+    assert commit is not None and len(commit) == 40
+    (repository / "eval.json").touch()
+    assert run_dir._git_state() == commit
+    (repository / "cref_jax" / "new.py").touch()
+    assert run_dir._git_state() == commit + "+"
+
+
+def test_an_installed_program_has_no_commit_of_the_repository_it_lies_below(
+    repository, monkeypatch
+):
+    installed = repository / ".venv" / "cref_jax" / "training" / "run_dir.py"
+    installed.parent.mkdir(parents=True)
+    installed.touch()
+    monkeypatch.setattr(run_dir, "__file__", str(installed))
+    assert run_dir._git_state() is None
