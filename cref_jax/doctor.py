@@ -176,7 +176,11 @@ def check_folders() -> Iterator[Finding]:
 
 def check_runtime() -> Iterator[Finding]:
     """Run the bundled policy's own test."""
-    times = deploy.self_test(sources.bundled_policy())
+    try:
+        times = deploy.self_test(sources.bundled_policy())
+    except deploy.PolicyFormatError as error:
+        yield Finding(f"the bundled policy: {error}", "install the program again", True)
+        return
     yield Finding("the bundled policy matches its training network; " + deploy.report(times)[1])
 
 

@@ -51,6 +51,13 @@ def test_a_version_that_was_not_tested_is_a_note(monkeypatch):
     assert "(1.0)" in finding.said and finding.cure and not finding.prevents
 
 
+def test_a_damaged_bundled_policy_prevents(monkeypatch, tmp_path):
+    (tmp_path / "manifest.json").write_text("{")
+    monkeypatch.setattr(doctor.sources, "bundled_policy", lambda: tmp_path)
+    (finding,) = doctor.check_runtime()
+    assert "JSONDecodeError" in finding.said and finding.cure and finding.prevents
+
+
 def test_the_door_lists_every_command_with_what_it_does(capsys):
     door.main([])
     said = capsys.readouterr().out

@@ -293,6 +293,13 @@ def test_smoothing_is_the_mean_of_what_is_known_weighted_by_episodes(values, end
         )
 
 
+def test_a_very_large_value_is_in_its_own_windows_alone():
+    values = np.full(30, 0.5)
+    values[10] = 1e17
+    mean = training_log.smooth(training_log.Log({"loss/kl": values}, (), 0), "loss/kl", 5)
+    assert list(mean) == [*[0.5] * 10, *[2e16] * 5, *[0.5] * 15]
+
+
 def test_iterations_in_which_no_episode_ended_do_not_shorten_the_episodes(run):
     # every other iteration says 0 s of 0 episodes; the others 10 s of 3
     assert "10.0 sepisode length, last 10 iterations" in shown(run).text

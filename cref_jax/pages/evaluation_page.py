@@ -29,7 +29,7 @@ TITLES = {
 }
 PLAIN = {  # record key of the suites walk and cross: (label, unit)
     "kind": ("kind of obstacle", ""),
-    "size_m": ("obstacle size", " m"),
+    "size_m": ("obstacle size", ""),
     "episodes": ("episodes", ""),
     "fell": ("episodes with a fall", ""),
     "fell_by_policy": ("of them, by policy", ""),
@@ -278,7 +278,8 @@ def _condition_table(conditions: Sequence[Record]) -> Html:
 
 def _plain_body(record: Record) -> Html:
     """Build the list of values and failure causes of a record without cells."""
-    values = [(name, f"{_value(record[k])}{u}") for k, (name, u) in PLAIN.items() if k in record]
+    shown = {**record, "size_m": _size(record)}
+    values = [(name, f"{_value(shown[k])}{u}") for k, (name, u) in PLAIN.items() if k in record]
     if record.get("suite") == "cross" and record.get("successes") and "seconds" in record:
         values.append(("mean time per success", f"{_value(record['seconds'])} s"))
     causes = record.get("by_cause") or {}

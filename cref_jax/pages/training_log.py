@@ -71,7 +71,7 @@ def smooth(log: Log, name: str, window: int) -> Float[np.ndarray, " N"]:
     weights = np.where(known, weights, 0.0)
     total = _moving_sum(weights * np.where(known, log[name], 0.0), window)
     weight = _moving_sum(weights, window)
-    has_value = weight > 0.5  # weights are counts; differences of float sums are inexact
+    has_value = weight > 0.0
     return np.where(has_value, total / np.where(has_value, weight, 1.0), np.nan)
 
 
@@ -119,7 +119,10 @@ def _parse_line(line: str) -> dict[str, Any] | None:
 
 
 def _moving_sum(values: Float[np.ndarray, " N"], window: int) -> Float[np.ndarray, " N"]:
-    """Compute the sum of each value and the `window` - 1 before it."""
-    total = np.cumsum(values)
-    total[window:] -= total[:-window].copy()
-    return total
+    """Compute the sum of each value and the `window` - 1 before it.
+
+    Each window is summed by itself: differences of sums from the start on would lose all values
+    after a very large one.
+    """
+    before = np.pad(values, (min(window, len(values)) - 1, 0))
+    return np.lib.stride_tricks.sliding_window_view(before, len(before) - len(values) + 1).sum(-1)

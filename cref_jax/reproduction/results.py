@@ -221,4 +221,5 @@ def _count(successes: int, trials: int) -> Record:
 
 
 def _interval(rate: Rate) -> Record:
-    return {"rate": rate.value, "wilson_low": rate.low, "wilson_high": rate.high}
+    value = None if math.isnan(rate.value) else rate.value  # JSON has no NaN
+    return {"rate": value, "wilson_low": rate.low, "wilson_high": rate.high}

@@ -5,18 +5,24 @@ import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
+
+
+ONE_REQUEST = 1.0  # s; assumed: a terminal that closes sends SIGHUP twice within a millisecond
 
 
 class StopRequest:
     """Records the first Ctrl-C, SIGTERM or SIGHUP so that work can be saved.
 
-    The second one ends the program at once. A second Ctrl-C is a KeyboardInterrupt, so that a
-    notebook stays alive. SIGHUP stays ignored under nohup.
+    Another one ends the program at once, unless it comes within `ONE_REQUEST` of the first. As
+    Ctrl-C it is a KeyboardInterrupt, so that a notebook stays alive. SIGHUP stays ignored under
+    nohup.
     """
 
     def __init__(self) -> None:
         self.requested = False
+        self._requested_at = 0.0
 
     def __enter__(self) -> "StopRequest":
         signals = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -32,10 +38,12 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
+        if self.requested and time.monotonic() - self._requested_at < ONE_REQUEST:
+            return
         if self.requested and number == signal.SIGINT:
             raise KeyboardInterrupt
         if self.requested:
             os._exit(128 + number)
-        self.requested = True
+        self.requested, self._requested_at = True, time.monotonic()
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("saving, then stopping; interrupt again to stop at once", file=sys.stderr)

@@ -44,6 +44,7 @@ def run(
     collect = lambda results: list(track(results, "walking", len(jobs), transient=True))
     if count == 1:
         return collect(map(make(*arguments), jobs))
+    others = set(multiprocessing.active_children())
     pool = concurrent.futures.ProcessPoolExecutor(
         count, multiprocessing.get_context("spawn"), _start_worker, (make, arguments)
     )
@@ -52,7 +53,7 @@ def run(
             futures = [pool.submit(_run_job, job) for job in jobs]
         return collect(future.result() for future in futures)
     except BaseException:  # such as Ctrl-C: do not wait for the other jobs
-        for child in multiprocessing.active_children():
+        for child in set(multiprocessing.active_children()) - others:
             child.kill()
         raise
     finally:

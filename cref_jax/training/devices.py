@@ -27,12 +27,19 @@ def select_device(device: Device) -> Literal["cpu", "gpu"]:
     """Choose where the program runs, before JAX is used for the first time.
 
     Raises:
-        ConfigError: a GPU is asked for, or its plugin installed, and JAX has none.
+        ConfigError: a GPU is asked for, or its plugin installed, and JAX has none; or JAX has no
+            device of JAX_PLATFORMS.
     """
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
     is_chosen = jax.config.jax_platforms == "cpu"  # here, or by JAX_PLATFORMS
-    backend = jax.default_backend()
+    try:
+        backend = jax.default_backend()
+    except (RuntimeError, AssertionError):  # JAX asserts that there is a device
+        raise ConfigError(
+            f"JAX_PLATFORMS={jax.config.jax_platforms}: JAX has no such device here; unset it, or "
+            "see whether the device's driver works and JAX's plugin for it is installed"
+        ) from None
     if backend != "gpu" and not is_chosen and jax_setup.has_cuda_plugin():
         raise ConfigError(
             "JAX's CUDA plugin is installed and finds no GPU: see whether nvidia-smi does, and "

@@ -92,7 +92,7 @@ class Reporter:
 
     def say(self, line: str) -> None:
         """Print one line above the table."""
-        self.console.print(line, highlight=False, soft_wrap=True)
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def chunk(self, first: int, log: Mapping[str, np.ndarray], seconds: float) -> None:
         """Report the iterations from `first` + 1 on, which took `seconds` in total."""

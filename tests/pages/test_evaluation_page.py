@@ -164,6 +164,8 @@ def test_the_records_of_one_kind_are_shown(tmp_path):
     cross = written(eval_records.CROSS, tmp_path).text
     assert "Crossing obstacles: gap, 30 cm" in cross and "95.5 %of 200 trials" in cross
     assert "mean time per success20.1 s" in cross
+    slope = written(eval_records.CROSS | {"kind": "slope"}, tmp_path).text
+    assert "Crossing obstacles: slope, 30 %" in slope and "obstacle size30 %" in slope
 
 
 @pytest.mark.parametrize("seconds", [None, float("nan")])  # as written today, and before

@@ -65,6 +65,13 @@ def test_of_21_trials_eleven_go_up():
     assert (part["way"], part["trials"]) == ("up", 11)
 
 
+def test_of_one_trial_none_goes_down_and_the_rate_is_none():
+    rows = list(results._stairs("full", [table(1, 0)]))
+    up, down = rows[0], rows[4]
+    assert (up["trials"], up["rate"]) == (1, 1.0)
+    assert (down["way"], down["trials"], down["rate"]) == ("down", 0, None)
+
+
 def test_touchdowns_are_of_both_feet_on_hard_stairs():
     up, down = summary()["touchdowns"]
     assert down["mad_m"]["each"] == [0.03, 0.05] and down["mad_m"]["mean"] == pytest.approx(0.04)

@@ -5,9 +5,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
+from cref_jax.system import interrupts
 from cref_jax.system.interrupts import StopRequest
 
 
@@ -22,7 +24,17 @@ def test_the_first_signal_is_a_request_and_handlers_come_back(capsys, number):
     assert "saving, then stopping" in capsys.readouterr().err
 
 
-def test_a_second_ctrl_c_is_an_interrupt_that_a_notebook_survives():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_comes_twice_at_once_is_one_request(number):
+    with StopRequest() as stop:
+        for _ in range(2):
+            os.kill(os.getpid(), number)
+            time.sleep(0.0003)
+        assert stop.requested
+
+
+def test_a_second_ctrl_c_is_an_interrupt_that_a_notebook_survives(monkeypatch):
+    monkeypatch.setattr(interrupts, "ONE_REQUEST", 0.0)
     with pytest.raises(KeyboardInterrupt), StopRequest():
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
@@ -30,10 +42,11 @@ def test_a_second_ctrl_c_is_an_interrupt_that_a_notebook_survives():
 
 def test_a_second_sigterm_ends_the_program_at_once():
     program = (
-        "import os, signal\n"
+        "import os, signal, time\n"
         "from cref_jax.system.interrupts import StopRequest\n"
         "with StopRequest():\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    time.sleep(1.0)\n"
         "    os.kill(os.getpid(), signal.SIGTERM)\n"
         "print('still here')\n"
     )

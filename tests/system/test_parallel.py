@@ -1,6 +1,7 @@
 """Work in several processes: the results are in order, and nothing outlives Ctrl-C."""
 
 import functools
+import multiprocessing
 import operator
 import os
 import signal
@@ -27,6 +28,18 @@ def test_results_are_in_the_order_of_the_jobs(count):
     # the worker is pow(2, job)
     make = functools.partial(functools.partial, operator.pow)
     assert parallel.run(make, (2,), [5, 1, 3], count) == [32, 2, 8]
+
+
+def test_an_error_of_a_job_leaves_other_processes_of_the_caller_alone():
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))
+    own.start()
+    try:
+        with pytest.raises(ZeroDivisionError):
+            parallel.run(functools.partial, (operator.truediv, 1), [0, 0], 2)
+        own.join(0.5)
+        assert own.is_alive()
+    finally:
+        own.kill()
 
 
 @pytest.mark.parametrize("seconds", [0.5, 6.0])  # while the workers start, and at their work

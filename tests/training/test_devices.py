@@ -1,5 +1,8 @@
-"""Over which devices the robots of a run are sharded."""
+"""Where a run goes on, and over which devices its robots are sharded."""
 
+import os
+import subprocess
+import sys
 from unittest.mock import Mock
 
 import jax
@@ -8,6 +11,7 @@ from jax.sharding import Mesh
 
 from cref_jax.config import presets
 from cref_jax.errors import ConfigError
+from cref_jax.system import jax_setup
 from cref_jax.training import devices
 
 MIXED = presets.build_config("mixed", None, "cpu")  # 256 robots, 4 minibatches, 14 turns of kinds
@@ -52,3 +56,24 @@ def test_of_several_processes_none_is_left_out(machine):
     assert devices.choose_mesh(MIXED).size == 4
     with pytest.raises(ConfigError, match="--devices 2: several processes train on all of their 4"):
         devices.choose_mesh(MIXED, 2)
+
+
+SELECT = """
+from cref_jax import cli
+from cref_jax.training import devices
+with cli.one_line_errors():
+    devices.select_device("auto")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("platform", ["cuda", "tpu"])  # of which JAX says so in different ways
+def test_a_platform_that_is_not_there_is_one_line_that_names_its_variable(platform):
+    if platform == "cuda" and jax_setup.has_cuda_plugin():
+        pytest.skip("this platform may be here")
+    environment = {**os.environ, "JAX_PLATFORMS": platform}
+    asked = [sys.executable, "-c", SELECT]
+    done = subprocess.run(asked, capture_output=True, text=True, env=environment)
+    said = done.stderr.splitlines()[-1]
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert said.startswith(f"error: JAX_PLATFORMS={platform}: JAX has no such device here")
