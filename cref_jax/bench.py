@@ -35,6 +35,7 @@ from cref_jax.system import jax_setup, parallel
 from cref_jax.terrain import lanes
 from cref_jax.training import devices, iteration, rollout
 
+STEP = "environment step, "  # before the name of an engine
 FOOTHOLD, ITERATION = "foothold reward", "iteration of make train"
 BLIND, BRAX = "iteration on flat ground, blind", "iteration of brax's PPO, the same"
 
@@ -143,7 +144,7 @@ def _measure_engine(
     """Measure a control step with this engine and, for mujoco, that of MuJoCo's own batch."""
     count = len(robots.begins)
     measure = functools.partial(_time_stage, options, rates, count)
-    whole = measure(f"environment step, {engine}", stages.step_environment, world, robots)
+    whole = measure(STEP + engine, stages.step_environment, world, robots)
     ours = measure(f"physics, {engine}", stages.step_physics, world, robots)
     whole, ours = whole._replace(share=None), ours._replace(share=None)
     if engine != "mujoco":
@@ -226,14 +227,13 @@ def show(
 def ratios(rows: list[StageTime]) -> dict[str, float]:
     """Compute the ratios between measured stages, for the largest number of robots."""
     seconds = {row.stage: row.seconds / row.robots for row in rows}
-    steps = {e: seconds.get(f"environment step, {e}") for e in ("mujoco", "mjx")}
+    steps = {stage.removeprefix(STEP): s for stage, s in seconds.items() if stage.startswith(STEP)}
     result = {}
-    if steps["mujoco"] and steps["mjx"]:
+    if "mujoco" in steps and "mjx" in steps:
         gain = steps["mjx"] / steps["mujoco"]
         result["engine mujoco over engine mjx, environment steps/s"] = gain
-    fastest = min((s for s in steps.values() if s), default=None)
-    if fastest:
-        result["terrain query, share of an environment step"] = seconds["terrain query"] / fastest
+    share = seconds["terrain query"] / min(steps.values())
+    result["terrain query, share of an environment step"] = share
     result["foothold reward, share of an iteration"] = seconds[FOOTHOLD] / seconds[ITERATION]
     if BRAX in seconds:
         result["our PPO over brax's, samples/s"] = seconds[BRAX] / seconds[BLIND]

@@ -19,6 +19,7 @@ from cref_jax.config import limits
 from cref_jax.config.ranges import Within
 from cref_jax.errors import ConfigError, TrainingError
 from cref_jax.pages import reproduction_page
+from cref_jax.physics.records import EngineName
 from cref_jax.reproduction import plan as planning
 from cref_jax.reproduction import progress, results
 from cref_jax.reproduction.commands import Runner
@@ -50,10 +51,14 @@ class Options(cli.DebugOption):
     num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
     """robots (default: those of the device's preset)"""
     settings: str = ""
-    """options of `train` for all rows alike, such as --settings="--ppo.epochs 3 --run.chunk 4" as
-    one argument"""
+    """settings of a run for all rows alike, as `train` takes them, but for network.variant; such as
+    --settings="--ppo.epochs 3 --run.chunk 4" as one argument"""
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """where the trainings run, which decides their preset"""
+    engine: EngineName = "auto"
+    """of the trainings: mujoco steps on the CPU, mjx and warp on the device"""
+    devices: Annotated[int | None, Within(1, 1_000_000)] = None
+    """devices per training (default: all)"""
     plan: bool = False
     """print rows, samples and hours, and train nothing"""
     out: Path = run_dir.ROOT / "reproduce"
@@ -69,14 +74,14 @@ def main(arguments: list[str] | None = None) -> None:
         jax_setup.prepare()
         plan = planning.build(
             o.variants, o.seeds, o.terrain, device, o.trials, o.samples, o.num_envs,
-            _split_words(o.settings),
+            _split_words(o.settings), o.engine, o.devices,
         )  # fmt: skip
         planning.check(o.out, plan)
         if o.plan:
             print_plan(o.out, plan)
             return
         cli.prepare_folder(o.out)
-        with lock(o.out), Runner() as runner:
+        with lock(o.out), Runner(**planning.environment(plan)) as runner:
             planning.claim(o.out, plan)
             reproduce(o.out, plan, runner)
         if runner.signal is not None:

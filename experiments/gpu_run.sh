@@ -26,13 +26,13 @@ pack() {
   [ -f "$tested" ] || fail "Python $python is not tested; 3.11 and 3.12 are"
   [ -z "$(find "$folder" -maxdepth 1 -name '*.whl' 2>/dev/null)" ] ||
     fail "$folder holds wheels; name a new folder"
-  local pip="$root/.venv/bin/python -m pip --disable-pip-version-check"
-  [ -x "$root/.venv/bin/python" ] || fail "no $root/.venv; make it with: make setup"
-  [ "${1:-}" != "--" ] || $root/.venv/bin/python -c "import warp" 2>/dev/null ||
+  local own="$root/.venv/bin/python" pip=("$root/.venv/bin/python" -m pip --disable-pip-version-check)
+  [ -x "$own" ] || fail "no $root/.venv; make it with: make setup"
+  [ "${1:-}" != "--" ] || "$own" -c "import warp" 2>/dev/null ||
     fail "kernels are compiled by MuJoCo Warp, which is not here: pip install 'cref-jax[warp]'"
   mkdir -p "$folder"
-  $pip wheel --quiet --no-deps --wheel-dir "$folder" "$root"
-  $pip download --quiet --only-binary=:all: --python-version "$python" --implementation cp \
+  "${pip[@]}" wheel --quiet --no-deps --wheel-dir "$folder" "$root"
+  "${pip[@]}" download --quiet --only-binary=:all: --python-version "$python" --implementation cp \
     --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
     --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 --dest "$folder" \
     --constraint "$tested" "$(echo "$folder"/cref_jax-*.whl)[warp]"
@@ -40,7 +40,7 @@ pack() {
   cp "$here/gpu_run.sh" "$folder/"
   if [ "${1:-}" = "--" ]; then
     shift
-    WARP_CACHE_PATH="$folder/cache/warp" "$root/.venv/bin/python" "$here/warp_kernels.py" "$@"
+    WARP_CACHE_PATH="$folder/cache/warp" "$own" "$here/warp_kernels.py" "$@"
   fi
   du -sh "$folder"
 }

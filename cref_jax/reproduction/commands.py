@@ -3,10 +3,12 @@
 Each has memory, compiled programs and devices to itself, and ends when this process does.
 """
 
+import contextlib
+import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 
 START = (sys.executable, "-c", "from cref_jax.system import tied; tied.run()")
@@ -17,10 +19,11 @@ class Runner:
     """Runs commands, and passes Ctrl-C, SIGTERM and the end of the terminal on to them.
 
     `signal` is the first of those that came, or None: after it no other command is to be started.
-    SIGHUP stays ignored under nohup.
+    SIGHUP stays ignored under nohup. `environment` are variables for all commands.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, **environment: str) -> None:
+        self._environment = environment
         self.signal: int | None = None
         self._child: subprocess.Popen[bytes] | None = None
 
@@ -39,10 +42,13 @@ class Runner:
         """Run a command, such as `train --terrain gap`, to its end, and return its exit code.
 
         It is a process group of its own, so that the terminal's Ctrl-C reaches it through this
-        process alone: a second one would end it before it has saved.
+        process alone: a second one would end it before it has saved. It saves as well where
+        `on_wait` raises.
         """
-        command = [*START, *words]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0) as child:
+        command, environment = [*START, *words], {**os.environ, **self._environment}
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, process_group=0, env=environment
+        ) as child:
             self._child = child
             if self.signal is not None:  # it came before there was a child to pass it on to
                 child.send_signal(self.signal)
@@ -50,7 +56,19 @@ class Runner:
                 try:
                     return child.wait(PAUSE)
                 except subprocess.TimeoutExpired:
-                    on_wait()
+                    with self._saving(child):
+                        on_wait()
+
+    @contextlib.contextmanager
+    def _saving(self, child: "subprocess.Popen[bytes]") -> Iterator[None]:
+        """On an error let the command save, since to close its standard input ends it at once."""
+        try:
+            yield
+        except BaseException:
+            if self.signal is None:  # else it is stopping already
+                child.terminate()
+            child.wait()
+            raise
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
         self.signal = self.signal or number

@@ -53,7 +53,9 @@ class Plan(NamedTuple):
     terrain: str
     device: str  # cpu or gpu, which have presets of their own
     trials: int  # per cell
-    settings: tuple[str, ...]  # options of `train` for all rows alike
+    settings: tuple[str, ...]  # options of `train` that are settings of all rows alike
+    engine: str  # of the trainings
+    devices: int | None  # per training; None: all
     configs: dict[str, Config]  # of each variant, with seed 0
 
     @property
@@ -76,6 +78,8 @@ def build(
     samples: float | None = None,
     num_envs: int | None = None,
     settings: Sequence[str] = (),
+    engine: str = "auto",
+    devices: int | None = None,
 ) -> Plan:
     """Build a plan; without `samples` and `num_envs` they are those of the device's preset.
 
@@ -91,7 +95,10 @@ def build(
     for variant in variants:
         c = presets.build_config(terrain, variant, device)
         if settings:
+            own = c.network.variant
             c = tyro.cli(Config, args=list(settings), default=c, prog="--settings")
+            if c.network.variant != own:
+                raise ConfigError("--settings: network.variant is each row's own; use --variants")
         c = dataclasses.replace(c, run=dataclasses.replace(c.run, seed=0))
         if num_envs:
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, num_envs=num_envs))
@@ -100,7 +107,10 @@ def build(
             c = dataclasses.replace(c, run=dataclasses.replace(c.run, iterations=count))
         configs[variant] = distillation.fill_in(robot.fill_in(c))
         limits.check(configs[variant])
-    return Plan(tuple(variants), tuple(seeds), terrain, device, trials, tuple(settings), configs)
+    return Plan(
+        tuple(variants), tuple(seeds), terrain, device, trials, tuple(settings), engine, devices,
+        configs,
+    )  # fmt: skip
 
 
 def count_iterations(samples: float, c: Config) -> int:
@@ -119,12 +129,20 @@ def choose_device(requested: str) -> str:
 def train_words(plan: Plan, row: Row, folder: Path, resume: bool) -> list[str]:
     """Write the command that trains a row, or goes on with it."""
     words = ["train", "--run-dir", str(folder / row.name), "--device", plan.device, "--no-evaluate"]
+    words += ["--engine", plan.engine]
+    if plan.devices is not None:
+        words += ["--devices", str(plan.devices)]
     if resume:
         return [*words, "--resume"]
     run = plan.configs[row.variant].run
     words += ["--terrain", plan.terrain, "--experiment", row.variant, *plan.settings]
     words += ["--seed", str(row.seed), "--num-envs", str(run.num_envs)]
     return [*words, "--iterations", str(run.iterations)]
+
+
+def environment(plan: Plan) -> dict[str, str]:
+    """Choose the variables for a plan's commands, as `eval` has no option for its device."""
+    return {"JAX_PLATFORMS": "cpu"} if plan.device == "cpu" else {}
 
 
 def claim(folder: Path, plan: Plan) -> None:
@@ -163,7 +181,9 @@ def check(folder: Path, plan: Plan) -> None:
 
 def _describe(plan: Plan) -> dict[str, Any]:
     configs = {name: dataclasses.asdict(c) for name, c in plan.configs.items()}
-    return {**plan._asdict(), "configs": configs}
+    described = {**plan._asdict(), "configs": configs}
+    del described["devices"]  # another number of them may go on
+    return described
 
 
 def _find_differences(own: Any, other: Any, where: str = "") -> Iterator[str]:

@@ -8,7 +8,6 @@ import threading
 import time
 from types import FrameType
 
-
 ONE_REQUEST = 1.0  # s; assumed: a terminal that closes sends SIGHUP twice within a millisecond
 
 

@@ -32,6 +32,30 @@ def test_a_mistake_is_told_before_anything_is_done(arguments, says, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+OWN_PYTHON = """#!/usr/bin/env bash
+echo "$3 $4 ${*: -1}" >> "$(dirname "$0")/calls"
+if [ "$4" = wheel ]; then touch "${*: -2:1}/cref_jax-1-py3-none-any.whl"; fi
+"""
+
+
+def test_a_folder_whose_name_has_spaces_is_packed(tmp_path):
+    root = tmp_path / "my project"
+    for folder in ("experiments", "constraints", ".venv/bin"):
+        (root / folder).mkdir(parents=True)
+    (root / "constraints" / "py312.txt").touch()
+    script = root / "experiments" / "gpu_run.sh"
+    script.write_text(SCRIPT.read_text())
+    python = root / ".venv" / "bin" / "python"
+    python.write_text(OWN_PYTHON)
+    python.chmod(0o755)
+    subprocess.run(["bash", str(script), "pack", "a pack"], check=True, cwd=tmp_path)
+    calls = (python.parent / "calls").read_text().splitlines()
+    assert [call.partition("-check ")[2] for call in calls] == [
+        f"wheel {root}", "download a pack/cref_jax-1-py3-none-any.whl[warp]",
+    ]  # fmt: skip
+    assert (tmp_path / "a pack" / "gpu_run.sh").exists()
+
+
 PYTHON = """#!/usr/bin/env bash
 echo "$*" >> calls
 if [[ "$*" == *cref_jax.train* ]]; then

@@ -20,12 +20,10 @@ signal.signal(signal.SIGTERM, save)
 print("trains", flush=True)
 time.sleep(60)
 """
-TIED = """
-import threading, time
+TIE = """
+import threading
 from cref_jax.system import tied
 threading.Thread(target=tied._end_with_input, daemon=True).start()
-print("trains", flush=True)
-time.sleep(60)
 """
 
 
@@ -49,6 +47,31 @@ def test_a_signal_is_passed_on_and_the_command_saves(monkeypatch, capfd, number)
     assert signal.getsignal(number) is before
 
 
+def test_a_command_saves_where_its_progress_cannot_be_said(monkeypatch, capfd):
+    monkeypatch.setattr(commands, "START", (sys.executable, "-c", TIE + SAVES))
+    monkeypatch.setattr(commands, "PAUSE", 0.05)
+    said = ""
+
+    def once_it_trains():
+        nonlocal said
+        said += capfd.readouterr().out
+        if "trains" in said:
+            raise BrokenPipeError
+
+    with Runner() as runner, pytest.raises(BrokenPipeError):
+        runner.run(["train"], once_it_trains)
+    assert "saved" in capfd.readouterr().out
+
+
+def test_a_variable_of_the_runner_is_one_of_its_commands(monkeypatch, capfd):
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    program = "import os; print(os.environ['JAX_PLATFORMS'], 'HOME' in os.environ)"
+    monkeypatch.setattr(commands, "START", (sys.executable, "-c", program))
+    with Runner(JAX_PLATFORMS="cpu") as runner:
+        assert runner.run(["eval"]) == 0
+    assert capfd.readouterr().out == "cpu True\n"
+
+
 def test_a_signal_that_came_between_two_commands_ends_the_next_one(monkeypatch):
     monkeypatch.setattr(commands, "START", (sys.executable, "-c", "import time; time.sleep(60)"))
     with Runner() as runner:
@@ -58,7 +81,10 @@ def test_a_signal_that_came_between_two_commands_ends_the_next_one(monkeypatch):
 
 def test_a_command_ends_with_the_process_that_started_it():
     child = subprocess.Popen(
-        [sys.executable, "-c", TIED], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", TIE + SAVES],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert child.stdin and child.stdout
     assert child.stdout.readline() == "trains\n"

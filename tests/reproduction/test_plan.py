@@ -72,6 +72,30 @@ def test_train_makes_the_plans_settings_of_the_words_that_it_is_given(tmp_path, 
     assert tyro.cli(train.Options, args=words).resume
 
 
+def test_the_engine_and_the_devices_are_given_to_each_training(tmp_path):
+    plan = build(engine="warp", devices=3)
+    for resume in (False, True):
+        _, *words = planning.train_words(plan, Row("full", 0), tmp_path, resume)
+        options, _ = tyro.cli(train.Options, args=words, return_unknown_args=True)
+        assert (options.engine, options.devices) == ("warp", 3)
+
+
+def test_a_plan_goes_on_with_other_devices_and_one_of_before_engines_is_read(tmp_path):
+    planning.claim(tmp_path, build(engine="warp", devices=3))
+    planning.check(tmp_path, build(engine="warp"))
+    with pytest.raises(ConfigError, match="engine warp, not auto; choose another --out"):
+        planning.check(tmp_path, build())
+    record = json.loads((tmp_path / "plan.json").read_text())
+    del record["engine"]
+    (tmp_path / "plan.json").write_text(json.dumps(record))
+    planning.check(tmp_path, build())
+
+
+def test_all_commands_of_a_plan_for_the_cpu_are_kept_from_a_gpu():
+    assert planning.environment(build()) == {"JAX_PLATFORMS": "cpu"}
+    assert planning.environment(build(samples=None, device="gpu")) == {}
+
+
 def test_eval_takes_the_words_that_it_is_given(tmp_path):
     command, *words = progress.eval_words(build(), Row("full", 4), tmp_path, "gate")
     o = tyro.cli(eval.Options, args=words)
@@ -116,6 +140,10 @@ def test_an_experiment_that_has_changed_between_two_starts_is_another_plan(tmp_p
         ({"seeds": (1, 1)}, "--seeds must name one or more, each once"),
         ({"variants": ()}, "--variants must name one or more, each once"),
         ({"seeds": tuple(range(11))}, "--seeds must be at most 10, not 11"),
+        (
+            {"settings": ("--network.variant", "full")},
+            "--settings: network.variant is each row's own; use --variants",
+        ),
         ({"num_envs": 6}, "6 robots do not split into 4 minibatches"),
         ({"samples": 1.0}, "--distillation.teacher-iterations must be below"),
     ],
