@@ -1,15 +1,18 @@
 """Whether an MJCF keeps the conventions that the rest of the program relies on."""
 
-import functools
 from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from cref_jax.errors import ConfigError
 from cref_jax.robot.description import Description
 
-MIRRORED = 1e-4  # m, rad or kg by which mirror images may differ, as rounded figures do
+MIRRORED = 1e-4  # m, rad, kg or the like by which mirror images may differ, as rounded figures do
+INERTIA = 1e-2  # of its trace, by which an inertia may; assumed: small ones have few digits
+POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
 
 def check_conventions(spec: mujoco.MjSpec, robot: Description) -> None:
@@ -39,7 +42,7 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     yield from _of_names(spec, robot)
     yield from _of_roles(spec, robot)
     yield from _of_contacts(spec)
-    yield from _of_mirror_images(spec)
+    yield from _of_mirror_images(spec, robot)
 
 
 def _of_motors(spec: mujoco.MjSpec, joints: list[str]) -> Iterator[str]:
@@ -109,19 +112,115 @@ def _of_contacts(spec: mujoco.MjSpec) -> Iterator[str]:
             yield f"it must have no {what}"
 
 
-def _of_mirror_images(spec: mujoco.MjSpec) -> Iterator[str]:
-    """Yield a complaint about each part whose partner is not its mirror image."""
-    polar, axial = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
-    near = functools.partial(np.allclose, rtol=0.0, atol=MIRRORED)
-    for right in (body for body in spec.bodies if body.name.startswith("right_")):
-        left = spec.body("left_" + right.name.removeprefix("right_"))
-        same = left and near(polar * left.pos, right.pos) and near(left.mass, right.mass)
-        if not same or not near(polar * left.ipos, right.ipos):
-            yield f"'{right.name}' must be the mirror image of the left one"
+def _of_mirror_images(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
+    """Yield a complaint about each part whose partner is not its mirror image.
+
+    They are compared as compiled, since a body may have its mass from its shapes alone.
+    """
+    model = spec.copy().compile()
+    names = [model.body(number).name for number in range(model.nbody)]
+    for right, name in enumerate(names):
+        if right == 0 or name.startswith("left_"):
+            continue
+        other = _other_side(name)
+        left = right if other == name else names.index(other) if other in names else 0
+        whose = "itself" if left == right else "the left one"
+        if not left or not _bodies_mirror(model, left, right):
+            yield f"'{name}' must be the mirror image of {whose}"
+        if not _shapes_mirror(model, left, right):
+            yield f"a capsule or sphere of '{name}' must be the mirror image of one on the left"
     for right in (joint for joint in spec.joints if joint.name.startswith("right_")):
-        left = spec.joint("left_" + right.name.removeprefix("right_"))
-        turn = float(np.dot(axial * left.axis, right.axis)) if left else 0.0  # 1 or -1
-        if not near(abs(turn), 1.0) or not near(
-            left.range if turn > 0.0 else -left.range[::-1], right.range
-        ):
-            yield f"'{right.name}' must have the mirrored axis and range of the left one"
+        yield from _of_joint_pair(model, spec.joint(_other_side(right.name)), right, robot)
+
+
+def _of_joint_pair(
+    model: mujoco.MjModel,
+    left: mujoco.MjsJoint | None,
+    right: mujoco.MjsJoint,
+    robot: Description,
+) -> Iterator[str]:
+    turn = float(np.dot(AXIAL * left.axis, right.axis)) if left else 0.0  # 1 or -1
+    if not left or not _near(abs(turn), 1.0) or not _near(_turned(left.range, turn), right.range):
+        yield f"'{right.name}' must have the mirrored axis and range of the left one"
+        return
+    if robot.nominal_angle(right.name) != np.sign(turn) * robot.nominal_angle(left.name):
+        yield f"'{right.name}' must turn the other way: its nominal angle mirrors the left one's so"
+    if not _near(_drive(model, left.name, turn), _drive(model, right.name, 1.0)):
+        yield f"'{right.name}' must have the motor, speed, armature and friction of the left one"
+
+
+def _other_side(name: str) -> str:
+    """Name the part on the other side; one without a side is its own."""
+    for side, other in (("left_", "right_"), ("right_", "left_")):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name
+
+
+def _near(a: Any, b: Any) -> bool:
+    return np.allclose(a, b, rtol=0.0, atol=MIRRORED)
+
+
+def _mirror(tensor: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    return POLAR[:, None] * tensor * POLAR
+
+
+def _axes(quat: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
+    """Compute the rotation matrix of a quaternion."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quat)
+    return matrix.reshape(3, 3)
+
+
+def _inertia(body: Any) -> Float[np.ndarray, "3 3"]:
+    axes = _axes(body.iquat)
+    return axes @ np.diag(body.inertia) @ axes.T
+
+
+def _bodies_mirror(model: mujoco.MjModel, left: int, right: int) -> bool:
+    """Compare place, orientation, mass, centre of mass and inertia of two bodies, or of one."""
+    a, b = model.body(left), model.body(right)
+    inertia = _inertia(b)
+    return (
+        _near([POLAR * a.pos, POLAR * a.ipos], [b.pos, b.ipos])
+        and _near(_mirror(_axes(a.quat)), _axes(b.quat))
+        and _near(a.mass, b.mass)
+        and np.allclose(_mirror(_inertia(a)), inertia, rtol=0.0, atol=INERTIA * np.trace(inertia))
+    )
+
+
+def _shapes_mirror(model: mujoco.MjModel, left: int, right: int) -> bool:
+    """Check that each capsule or sphere of two bodies, or of one, has its mirror image."""
+    images = [(POLAR * p, _mirror(e), *of) for p, e, *of in _shapes(model, left)]
+    shapes = list(_shapes(model, right))
+    found = [any(all(map(_near, image, shape)) for image in images) for shape in shapes]
+    return len(images) == len(shapes) and all(found)
+
+
+def _shapes(model: mujoco.MjModel, body: int) -> Iterator[tuple[Any, ...]]:
+    """Yield place, extent along the axis, radius and kind of a body's capsules and spheres."""
+    capsule, sphere = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
+    for number in np.flatnonzero(model.geom_bodyid == body):
+        kind, size = model.geom_type[number], model.geom_size[number]
+        if kind in (capsule, sphere):
+            axis = _axes(model.geom_quat[number])[:, 2]  # of either sign
+            half = size[1] if kind == capsule else 0.0
+            yield model.geom_pos[number], half * np.outer(axis, axis), size[0], kind
+
+
+def _drive(model: mujoco.MjModel, joint: str, turn: float) -> Float[np.ndarray, " n"]:
+    """Collect what moves, limits and brakes a joint, for one that turns the other way if -1."""
+    number = model.joint(joint).id
+    motor = int(np.flatnonzero(model.actuator_trnid[:, 0] == number)[0])
+    dof = model.jnt_dofadr[number]
+    parts = (
+        model.actuator_gainprm[motor], model.actuator_biasprm[motor],
+        _turned(model.actuator_forcerange[motor], turn), model.jnt_user[number][:1],
+        model.dof_armature[dof], model.dof_damping[dof], model.dof_frictionloss[dof],
+    )  # fmt: skip
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+def _turned(limits: Float[np.ndarray, " 2"], turn: float) -> Float[np.ndarray, " 2"]:
+    """Mirror a lower and an upper limit."""
+    return limits if turn > 0.0 else -limits[::-1]

@@ -3,7 +3,9 @@
 import dataclasses
 
 import mujoco
+import numpy as np
 import pytest
+from biped import BIPED
 
 from cref_jax import config, robot
 from cref_jax.errors import ConfigError
@@ -54,6 +56,57 @@ def with_another_range(spec):
     spec.joint("left_hip_roll_joint").range = [-0.3, 2.9]
 
 
+def with_a_knee_that_turns_the_other_way(spec):
+    knee = spec.joint("right_knee_joint")
+    knee.axis, knee.range = -knee.axis, -knee.range[::-1]
+
+
+def with_a_turned_shank(spec):
+    spec.body("right_knee_link").quat = [1.0, 0.0, 0.02, 0.0]
+
+
+def with_another_inertia(spec):
+    spec.body("right_hip_yaw_link").fullinertia *= 1.1
+
+
+def with_a_centre_of_mass_aside(spec):
+    spec.body("pelvis").ipos[1] += 0.002
+
+
+def with_a_lower_sole(spec):
+    spec.geom("right_sole_0").pos[2] -= 0.002
+
+
+def with_a_thicker_thigh(spec):
+    spec.geom("right_hip_yaw_link").size[0] += 0.002
+
+
+def with_a_stronger_gain(spec):
+    motor = spec.actuator("right_knee_joint")
+    motor.gainprm[0] *= 1.01
+    motor.biasprm[1] *= 1.01
+
+
+def with_a_weaker_motor(spec):
+    spec.actuator("right_knee_joint").forcerange = [-10.0, 10.0]
+
+
+def with_a_slower_joint(spec):
+    spec.joint("right_knee_joint").userdata = [1.0]
+
+
+def with_a_heavier_rotor(spec):
+    spec.joint("right_knee_joint").armature += 0.001
+
+
+def with_more_friction(spec):
+    spec.joint("right_knee_joint").frictionloss += 0.1
+
+
+def with_more_damping(spec):
+    spec.joint("right_knee_joint").damping[0] += 0.1
+
+
 def with_a_collision(spec):
     spec.geom("pelvis").contype = 1
 
@@ -89,6 +142,21 @@ def test_every_robot_keeps_the_conventions(name):
         (without_a_sole, "there is no sphere whose name begins with 'left_sole'"),
         (with_a_lighter_shank, "'right_knee_link' must be the mirror image of the left one"),
         (with_another_range, "'right_hip_roll_joint' must have the mirrored axis and range"),
+        (with_a_knee_that_turns_the_other_way, "'right_knee_joint' must turn the other way"),
+        (with_a_turned_shank, "'right_knee_link' must be the mirror image of the left one"),
+        (with_another_inertia, "'right_hip_yaw_link' must be the mirror image of the left one"),
+        (with_a_centre_of_mass_aside, "'pelvis' must be the mirror image of itself"),
+        (with_a_lower_sole, "a capsule or sphere of 'right_ankle_roll_link' must be the mirror"),
+        (with_a_thicker_thigh, "a capsule or sphere of 'right_hip_yaw_link' must be"),
+        (with_a_stronger_gain, "'right_knee_joint' must have the motor"),
+        (with_a_weaker_motor, "'right_knee_joint' must have the motor"),
+        (with_a_slower_joint, "'right_knee_joint' must have the motor, speed"),
+        (with_a_heavier_rotor, "'right_knee_joint' must have the motor, speed, armature"),
+        (
+            with_more_friction,
+            "'right_knee_joint' must have the motor, speed, armature and friction",
+        ),
+        (with_more_damping, "'right_knee_joint' must have the motor, speed, armature and friction"),
         (with_a_collision, "geom 'pelvis' must have contype and conaffinity 0"),
         (with_a_sensor, "it must have no sensors"),
         (with_one_arm_renamed, "'left_forearm_link' has no 'right_forearm_link'"),
@@ -99,6 +167,26 @@ def test_a_breach_is_named(breach, says):
     breach(spec)
     with pytest.raises(ConfigError, match=says):
         check_conventions(spec, X2)
+
+
+def weighed_by_its_shapes():
+    """Return the biped with hands whose masses are those of their capsules alone."""
+    spec = mujoco.MjSpec.from_file(str(BIPED.xml))
+    for name in BIPED.hands:
+        body = spec.body(name)
+        body.explicitinertial = False
+        body.mass, body.ipos, body.inertia = 0.0, [np.nan, 0.0, 0.0], [0.0, 0.0, 0.0]
+        for geom in body.geoms:
+            geom.mass = 0.4
+    return spec
+
+
+def test_bodies_that_weigh_what_their_shapes_do_are_compared():
+    check_conventions(weighed_by_its_shapes(), BIPED)
+    other = weighed_by_its_shapes()
+    other.body(BIPED.hands[1]).geoms[0].mass = 0.3
+    with pytest.raises(ConfigError, match=f"'{BIPED.hands[1]}' must be the mirror image of the"):
+        check_conventions(other, BIPED)
 
 
 def test_the_base_comes_first():
