@@ -28,7 +28,7 @@ class WalkResult(NamedTuple):
     speed_error: float  # m/s, |commanded - walked| forward, mean over episodes
     tracking_error: float  # m/s, of the planar velocity at each step
     airborne: tuple[float, float]  # share of time off the ground, left and right foot
-    step_seconds: float  # mean time between touchdowns of one foot
+    step_seconds: float | None  # mean time between touchdowns of one foot; None without any
     sideways: dict[str, float]  # m, see lateral_drift.summarize
     gait: list[dict[str, Any]]  # of the first episode, see gait_pattern.describe
 
@@ -39,7 +39,7 @@ class WalkResult(NamedTuple):
             f"{self.episodes - self.fell} of {self.episodes} episodes without a fall, "
             f"speed error {self.speed_error:.3f} m/s, "
             f"feet off the ground {left:.0%} and {right:.0%} of the time, "
-            + (f"{self.step_seconds:.2f} s per stride" if self.step_seconds < 5.0 else "no steps")
+            + (f"{self.step_seconds:.2f} s per stride" if self.step_seconds else "no steps")
         )
 
 
@@ -70,6 +70,7 @@ def pool(walks: Sequence[WalkResult]) -> WalkResult:
     """Pool the outcomes of policies, each with as many episodes; the gait is the first one's."""
     total = lambda name: sum(getattr(w, name) for w in walks)
     average = lambda values: float(np.mean(list(values)))
+    strides = [w.step_seconds for w in walks if w.step_seconds is not None]
     return WalkResult(
         episodes=total("episodes"),
         fell=total("fell"),
@@ -77,7 +78,7 @@ def pool(walks: Sequence[WalkResult]) -> WalkResult:
         speed_error=average(w.speed_error for w in walks),
         tracking_error=average(w.tracking_error for w in walks),
         airborne=(average(w.airborne[0] for w in walks), average(w.airborne[1] for w in walks)),
-        step_seconds=average(w.step_seconds for w in walks),
+        step_seconds=average(strides) if strides else None,
         sideways={
             "drift_m": average(w.sideways["drift_m"] for w in walks),
             "largest_m": average(w.sideways["largest_m"] for w in walks),
@@ -139,7 +140,7 @@ def _summarize(ending: Ending, trace: _EpisodeStep, c: Config) -> WalkResult:
         speed_error=float(np.abs(of_episode(trace.forward_error)).mean()),
         tracking_error=float(of_episode(trace.tracking_error).mean()),
         airborne=(float(airborne[0]), float(airborne[1])),
-        step_seconds=float(seconds / max(touchdowns, 1)),
+        step_seconds=float(seconds / touchdowns) if touchdowns else None,
         sideways=lateral_drift.summarize(*lateral_drift.measure(trace.y, alive)),
         gait=[{"lane": "flat", **gait_pattern.describe(first, c.physics.control_period)}],
     )

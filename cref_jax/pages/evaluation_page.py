@@ -279,7 +279,8 @@ def _condition_table(conditions: Sequence[Record]) -> Html:
 def _plain_body(record: Record) -> Html:
     """Build the list of values and failure causes of a record without cells."""
     shown = {**record, "size_m": _size(record)}
-    values = [(name, f"{_value(shown[k])}{u}") for k, (name, u) in PLAIN.items() if k in record]
+    known = [k for k in PLAIN if record.get(k) is not None]
+    values = [(PLAIN[k][0], f"{_value(shown[k])}{PLAIN[k][1]}") for k in known]
     if record.get("suite") == "cross" and record.get("successes") and "seconds" in record:
         values.append(("mean time per success", f"{_value(record['seconds'])} s"))
     causes = record.get("by_cause") or {}

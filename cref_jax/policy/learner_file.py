@@ -78,10 +78,11 @@ def read(path: Path, world: World) -> TrainedPolicy:
     """
     arrays, c = _load_arrays(path), read_config(path)
     like = learner_shapes(c, world)
-    for name, leaf in pytree_digest.by_path(like).items():
+    leaves = pytree_digest.by_path(like)
+    for name, leaf in leaves.items():
         if name not in arrays or arrays[name].shape != leaf.shape:
             raise ConfigError(f"{path} does not fit these settings: {name} is not {leaf.shape}")
-    placed = {name: jax.numpy.asarray(x) for name, x in arrays.items() if name != _SETTINGS}
+    placed = {name: jax.numpy.asarray(arrays[name]) for name in leaves}
     iteration, samples = _length(arrays, c)
     return TrainedPolicy(c, pytree_digest.fill_from(like, placed), iteration, path, samples)
 

@@ -12,6 +12,7 @@ from cref_jax.robot.description import Description
 
 MIRRORED = 1e-4  # m, rad, kg or the like by which mirror images may differ, as rounded figures do
 INERTIA = 1e-2  # of its trace, by which an inertia may; assumed: small ones have few digits
+ASIDE = 5e-3  # m, of a centre of mass in the middle; assumed: trunks carry a little on one side
 POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
 
@@ -120,13 +121,14 @@ def _of_mirror_images(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     model = spec.copy().compile()
     names = [model.body(number).name for number in range(model.nbody)]
     for right, name in enumerate(names):
-        if right == 0 or name.startswith("left_"):
-            continue
         other = _other_side(name)
-        left = right if other == name else names.index(other) if other in names else 0
-        whose = "itself" if left == right else "the left one"
+        if other == name and abs(model.body_ipos[right, 1]) > ASIDE:
+            yield f"'{name}' must have its centre of mass in the middle, within {1e3 * ASIDE:g} mm"
+        if not name.startswith("right_"):
+            continue
+        left = names.index(other) if other in names else 0
         if not left or not _bodies_mirror(model, left, right):
-            yield f"'{name}' must be the mirror image of {whose}"
+            yield f"'{name}' must be the mirror image of the left one"
         if not _shapes_mirror(model, left, right):
             yield f"a capsule or sphere of '{name}' must be the mirror image of one on the left"
     for right in (joint for joint in spec.joints if joint.name.startswith("right_")):
@@ -178,7 +180,7 @@ def _inertia(body: Any) -> Float[np.ndarray, "3 3"]:
 
 
 def _bodies_mirror(model: mujoco.MjModel, left: int, right: int) -> bool:
-    """Compare place, orientation, mass, centre of mass and inertia of two bodies, or of one."""
+    """Compare place, orientation, mass, centre of mass and inertia of two bodies."""
     a, b = model.body(left), model.body(right)
     inertia = _inertia(b)
     return (
@@ -190,7 +192,7 @@ def _bodies_mirror(model: mujoco.MjModel, left: int, right: int) -> bool:
 
 
 def _shapes_mirror(model: mujoco.MjModel, left: int, right: int) -> bool:
-    """Check that each capsule or sphere of two bodies, or of one, has its mirror image."""
+    """Check that each capsule or sphere of two bodies has its mirror image."""
     images = [(POLAR * p, _mirror(e), *of) for p, e, *of in _shapes(model, left)]
     shapes = list(_shapes(model, right))
     found = [any(all(map(_near, image, shape)) for image in images) for shape in shapes]
