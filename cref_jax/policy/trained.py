@@ -1,6 +1,5 @@
 """A trained policy, and its loading from a run."""
 
-import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,7 +65,8 @@ def learner_shapes(c: Config, world: World) -> ppo.TrainState:
     """
     critic = {"critic": c.network.critic, "critic_sees": c.network.critic_sees}
     readout = {"readout_weight": c.ppo.readout_weight}
-    changes = {"network": critic, "ppo": readout, "scan": dataclasses.asdict(c.scan)}
+    scan = {"x": c.scan.x, "y": c.scan.y, "ahead": c.scan.ahead}
+    changes = {"network": critic, "ppo": readout, "scan": scan}
     as_trained = world.replace(config=override(world.config, changes))
     return jax.eval_shape(lambda w: iteration.initial_state(w).train, as_trained)
 
