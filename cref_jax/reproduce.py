@@ -51,7 +51,7 @@ class Options(cli.DebugOption):
     num_envs: Annotated[int | None, Within(1, 1_000_000)] = None
     """robots (default: those of the device's preset)"""
     settings: str = ""
-    """settings of a run for all rows alike, as `train` takes them, but for network.variant; such as
+    """settings of a run for all rows alike, as `train` takes them, except network.variant; such as
     --settings="--ppo.epochs 3 --run.chunk 4" as one argument"""
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """where the trainings run, which decides their preset"""
