@@ -185,7 +185,7 @@ def train(options: Options, c: Config) -> None:
     run = options.run_dir or name(_name(options))
     options = dataclasses.replace(options, run_dir=run)
     with lock(run) if processes.is_first() else contextlib.nullcontext():
-        with run_dir.checkpoints(run, c.run.keep) as steps:
+        with run_dir.keep_settings_if_refused(run), run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
             lines = _opening_lines(run, c, mesh.size, options, first)
             with _open_reporter(run, c, first, options) as report:

@@ -415,6 +415,19 @@ def test_a_run_goes_on_with_another_number_of_robots_and_keeps_what_it_learned(
 
 
 @pytest.mark.slow
+def test_robots_that_do_not_fit_are_not_asked_for_again(first, tmp_path, monkeypatch, capsys):
+    def refuse(*_):
+        raise ConfigError("16 robots need 9.0 GiB")
+
+    shutil.copytree(first, tmp_path / "run")
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(devices, "check_memory", refuse)
+        run(tmp_path / "run", "--iterations", "3", "--num-envs", "16", "--resume")
+    assert "16 robots need 9.0 GiB" in capsys.readouterr().err
+    assert run_dir.read_config(tmp_path / "run") == run_dir.read_config(first)
+
+
+@pytest.mark.slow
 def test_devices_share_the_robots_and_hold_the_same_parameters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -18,7 +18,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,19 @@ def write_config(run: Path, c: Config) -> None:
     part = run / "config.json.part"
     part.write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
     part.replace(run / "config.json")
+
+
+@contextlib.contextmanager
+def keep_settings_if_refused(run: Path) -> Iterator[None]:
+    """Put a run's settings back where a ConfigError refuses those that it was to go on with."""
+    file = run / "config.json"
+    before = file.read_text() if file.exists() else None
+    try:
+        yield
+    except ConfigError:
+        if before is not None:
+            file.write_text(before)
+        raise
 
 
 def write_origin(
