@@ -7,6 +7,7 @@ import dataclasses
 import datetime
 import json
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -185,7 +186,7 @@ def train(options: Options, c: Config) -> None:
     run = options.run_dir or name(_name(options))
     options = dataclasses.replace(options, run_dir=run)
     with lock(run) if processes.is_first() else contextlib.nullcontext():
-        with run_dir.keep_settings_if_refused(run), run_dir.checkpoints(run, c.run.keep) as steps:
+        with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
             lines = _opening_lines(run, c, mesh.size, options, first)
             with _open_reporter(run, c, first, options) as report:
@@ -254,17 +255,25 @@ def _compile(
     return programs
 
 
-def _open_reporter(run: Path, c: Config, first: int, options: Options) -> Reporter | SilentReporter:
+@contextlib.contextmanager
+def _open_reporter(
+    run: Path, c: Config, first: int, options: Options
+) -> Iterator[Reporter | SilentReporter]:
     """Write the run's settings and origin, and open its log; the first process alone does."""
     if not processes.is_first():
-        return SilentReporter()
-    run_dir.write_config(run, c)
-    stages = distillation.samples_by_stage(c, first)
-    engine = resolve_engine(options.engine)
-    run_dir.write_origin(run, first, c.terrain.name, engine, stages, c.run.num_envs)
-    each, before = c.run.num_envs * c.ppo.horizon, run_dir.count_samples(run, c, first)
-    wandb = dataclasses.asdict(c) if options.wandb else None
-    return Reporter(run, first, c.run.iterations, each, before, options.tensorboard, wandb)
+        with SilentReporter() as report:
+            yield report
+        return
+    with run_dir.try_config(run, c):
+        stages = distillation.samples_by_stage(c, first)
+        engine = resolve_engine(options.engine)
+        run_dir.write_origin(run, first, c.terrain.name, engine, stages, c.run.num_envs)
+        each, before = c.run.num_envs * c.ppo.horizon, run_dir.count_samples(run, c, first)
+        wandb = dataclasses.asdict(c) if options.wandb else None
+        with Reporter(
+            run, first, c.run.iterations, each, before, options.tensorboard, wandb
+        ) as report:
+            yield report
 
 
 def _first_iteration(steps: Checkpoints, resume: bool, run: Path) -> int:

@@ -37,21 +37,26 @@ PROGRAM = ("cref_jax", "experiments", "terrains", "pyproject.toml")  # what deci
 
 def write_config(run: Path, c: Config) -> None:
     """Write all settings of the run; the file before stays until this one is whole."""
+    _replace_config(run, json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+
+
+def _replace_config(run: Path, text: str) -> None:
     part = run / "config.json.part"
-    part.write_text(json.dumps(dataclasses.asdict(c), indent=2) + "\n")
+    part.write_text(text)
     part.replace(run / "config.json")
 
 
 @contextlib.contextmanager
-def keep_settings_if_refused(run: Path) -> Iterator[None]:
-    """Put a run's settings back where a ConfigError refuses those that it was to go on with."""
+def try_config(run: Path, c: Config) -> Iterator[None]:
+    """Write the settings that a run goes on with; a ConfigError puts those before back."""
     file = run / "config.json"
     before = file.read_text() if file.exists() else None
+    write_config(run, c)
     try:
         yield
     except ConfigError:
         if before is not None:
-            file.write_text(before)
+            _replace_config(run, before)
         raise
 
 
