@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from cref_jax.live.session import View
 from cref_jax.rendering import policy_overlay
@@ -41,12 +41,16 @@ def _spotlight(
     """Draw the depth image in grey, and glowing where the policy attends to it."""
     if depth is None or attention is None:
         return Image.new("RGB", size, FAINT)
-    rows = round((len(attention) * depth.shape[0] / depth.shape[1]) ** 0.5)
+    height, width = depth.shape
+    rows = round((len(attention) * height / width) ** 0.5)
     weight = (attention / attention.max()).reshape(rows, -1)
-    share = _resize(weight, size)[..., None]
-    grey = 40.0 + 200.0 * _resize(0.5 - depth, size)[..., None]  # near is light
+    scale = min(size[0] / width, size[1] / height)
+    inner = round(scale * width), round(scale * height)
+    share = _resize(weight, inner)[..., None]
+    grey = 40.0 + 200.0 * _resize(0.5 - depth, inner)[..., None]  # near is light
     mixed = (1.0 - share) * grey + share * np.array(GLOW)
-    return Image.fromarray(np.clip(mixed, 0, 255).astype(np.uint8))
+    image = Image.fromarray(np.clip(mixed, 0, 255).astype(np.uint8))
+    return ImageOps.pad(image, size, color=FAINT)
 
 
 def _resize(values: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "H W"]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import matplotlib
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 WIDTH = 320  # pixels
 SECONDS = 4.0  # length of the gate history shown
@@ -49,11 +49,14 @@ def draw(view: PolicyView, height: int, d_max: float, period: float, sees: bool)
 
 
 def colour_depth(depth: Float[np.ndarray, "H W"] | None, size: tuple[int, int]) -> Image.Image:
-    """Draw a depth image, normalised, `size` pixels wide and high; grey where there is none."""
+    """Draw a depth image, normalised, `size` pixels wide and high; grey where there is none.
+
+    It keeps its proportions; what remains beside it is grey, too.
+    """
     if depth is None:
         return Image.new("RGB", size, FAINT)
     colours = matplotlib.colormaps[DEPTHS](np.clip(depth + 0.5, 0.0, 1.0), bytes=True)
-    return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
+    return _fit(colours, size)
 
 
 def _attention_image(view: PolicyView, size: tuple[int, int]) -> Image.Image:
@@ -66,8 +69,13 @@ def _attention_image(view: PolicyView, size: tuple[int, int]) -> Image.Image:
     height, width = view.depth.shape
     rows = round((len(view.attention) * height / width) ** 0.5)
     grid = (view.attention / view.attention.max()).reshape(rows, -1)
-    colours = matplotlib.colormaps["magma"](grid, bytes=True)
-    return Image.fromarray(colours[..., :3]).resize(size, Image.Resampling.NEAREST)
+    return _fit(matplotlib.colormaps["magma"](grid, bytes=True), size)
+
+
+def _fit(colours: UInt8[np.ndarray, "h w 4"], size: tuple[int, int]) -> Image.Image:
+    """Enlarge an image into `size`, wide and high, pixel by pixel."""
+    image = Image.fromarray(colours[..., :3])
+    return ImageOps.pad(image, size, Image.Resampling.NEAREST, FAINT)
 
 
 def draw_gate(

@@ -60,7 +60,17 @@ def test_the_attention_is_where_its_token_is_in_an_image_of_any_shape():
     part = image[top : top + high, left : left + wide].sum(axis=2)
     down, across = np.nonzero(part == part.max())
     np.testing.assert_allclose(down.mean() / high, 1.5 / 8, atol=0.02)
-    np.testing.assert_allclose(across.mean() / wide, 1.5 / 8, atol=0.02)
+    # 111 pixels wide, too, in the middle of 148
+    np.testing.assert_allclose((across.mean() - 18.5) / high, 1.5 / 8, atol=0.02)
+
+
+def test_depth_keeps_its_proportions():
+    whole = policy_overlay.colour_depth(np.zeros((48, 64)), (296, 222))
+    assert not (np.asarray(whole) == policy_overlay.FAINT).all(axis=2).any()
+    square = np.asarray(policy_overlay.colour_depth(np.zeros((64, 64)), (296, 222)))
+    beside = (square == policy_overlay.FAINT).all(axis=2)
+    assert square.shape == (222, 296, 3)
+    assert beside[:, :37].all() and beside[:, -37:].all() and not beside[:, 37:-37].any()
 
 
 def test_before_the_first_frame_it_is_grey_and_does_not_fail():
