@@ -20,17 +20,18 @@ ABSENT = np.array([0.0, 0.0, -100.0, 0.0, 0.0, -100.0, 0.0], np.float32)  # far 
 
 def sample_structures(world: World, state: EnvState) -> Float[Array, "S 7"]:
     """Draw the capsules of an episode: both ends and radius, m, in the lane's coordinates."""
-    keys = jax.random.split(episode_key(world, state), world.config.randomisation.structures)
+    count = world.config.randomisation.structures
+    keys = jax.random.split(episode_key(world, state, salt=0), count)
     ground = world.lanes.tile(state.level, state.kind, state.variant)
     chance = PRESENT * state.spread.camera
     return jax.vmap(lambda k: _sample_structure(ground, world.lanes.end, chance, k))(keys)
 
 
-def episode_key(world: World, state: EnvState, salt: int | None = None) -> PRNGKeyArray:
-    """Derive the random key of an episode from where it began."""
+def episode_key(world: World, state: EnvState, salt: int) -> PRNGKeyArray:
+    """Derive a random key of an episode from where it began; each use has its own salt."""
     place = jax.lax.bitcast_convert_type(state.start, jnp.uint32)
     key = jax.random.key(world.config.terrain.seed)
-    for number in (*place, state.kind, *(() if salt is None else (salt,))):
+    for number in (*place, state.kind, salt):
         key = jax.random.fold_in(key, number)
     return key
 

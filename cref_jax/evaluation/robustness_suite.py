@@ -27,13 +27,15 @@ RAILS = {"structures": 8, "push_yaw_rate": 1.0}
 """Capsules in the depth image, and rad/s by which pushes turn the robot, as if a wrist caught on a
 rail; as in experiments/robust.toml"""
 NO_FAULTS = dict.fromkeys(protocol.DEPTH_FAULTS, 0.0)
+NO_TILT = {"camera_pitch": 0.0, "camera_position": 0.0}
 WORLDS: tuple[tuple[tuple[str, ...], dict[str, float]], ...] = (
-    ((EVERYTHING, STRUCTURES), {}),
-    ((DEPTH,), {"structures": 0, "camera_pitch": 0.0, "camera_position": 0.0}),
+    ((EVERYTHING,), {}),
+    ((STRUCTURES,), {**NO_TILT, **NO_FAULTS}),
+    ((DEPTH,), {**NO_TILT, "structures": 0}),
     (Spread._fields, {"structures": 0, **NO_FAULTS}),
 )
-"""Parts, and what is changed in the randomisation of their world. A spread of `camera` decides how
-large faults of depth are, so that `STRUCTURES` has none."""
+"""Parts, and what is changed in the randomisation of their world. The spread of `camera` is that of
+its mount, of the structures that it sees and of faults of depth: a world has one of these alone."""
 BEYOND = "beyond"  # level: sizes of SSR (arXiv 2605.30770) beyond the paper's
 LEVELS = (*paper_results.LEVELS, BEYOND)
 BEYOND_SIZES = {"stairs": 0.25, "gap": 0.90, "platform": 0.45}  # m; stairs are not tested there
@@ -181,8 +183,7 @@ def parts_table(results: Sequence[dict[str, Any]]) -> Table:
 def _spread(part: str) -> Spread:
     if part == EVERYTHING:
         return Spread(*[np.float32(1.0)] * len(Spread._fields))
-    # faults of depth are as large as `camera` says
-    own = "camera" if part == DEPTH else part
+    own = "camera" if part in (STRUCTURES, DEPTH) else part
     return Spread(*(np.float32(name == own) for name in Spread._fields))
 
 

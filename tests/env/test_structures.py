@@ -66,3 +66,11 @@ def test_the_camera_sees_them_nearer_than_the_ground_and_no_one_else_does(world,
     assert (after <= before + 1e-6).all() and (after < before - 0.05).any(axis=(1, 2)).any()
     off = config.override(many, {"randomisation": {"enabled": False}})
     np.testing.assert_array_equal(render(off), before)
+
+
+def test_no_structure_is_drawn_with_the_key_of_the_faults_of_depth(world, fresh_states):
+    # split(key, 8)[1] is fold_in(key, 1)
+    key = lambda salt: structures.episode_key(world, one(fresh_states), salt)
+    data = lambda keys: {tuple(x) for x in np.asarray(jax.random.key_data(keys))}
+    assert not data(jax.random.split(key(0), 8)) & data(key(1)[None])
+    assert data(jax.random.split(key(0), 8)) & data(jax.random.fold_in(key(0), 1)[None])
