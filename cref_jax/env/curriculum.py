@@ -25,7 +25,9 @@ def next_level(
     from_start = state.start[0] <= world.config.episode.start_x[1]
     passed = over.finished | (walked > c.up * world.lanes.length)
     up = from_start & ~over.terminated & ~over.stalled & passed
-    down = ~up & (walked < c.down * _commanded_distance(world, state))
+    asked = _commanded_distance(world, state)
+    # nothing is asked of a robot that was told to stand all the time, however it drifts
+    down = ~up & (asked > 0.0) & (walked < c.down * asked)
     earned = state.rank + (up.astype(jnp.int32) - down) * (state.level == state.rank)
     rank = jnp.clip(earned, 0, top)
     key_review, key_level = jax.random.split(key)

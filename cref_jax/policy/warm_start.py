@@ -8,12 +8,13 @@ from cref_jax.policy.trained import TrainedPolicy
 
 def start_from_policy(fresh: ppo.TrainState, policy: TrainedPolicy) -> ppo.TrainState:
     """Start a new training from the policy's actor and observation statistics."""
-    trained = policy.train.statistics.obs
-    statistics = fresh.statistics.obs.replace(
+    trained, obs = policy.train.statistics.obs, fresh.statistics.obs
+    variance = jnp.maximum(jnp.square(trained.std) - obs.std_eps, 0.0)
+    statistics = obs.replace(
         mean=trained.mean,
         std=trained.std,
-        summed_variance=float(policy.samples) * jnp.square(trained.std),  # int32 holds too few
-        count=fresh.statistics.obs.count + policy.samples,
+        summed_variance=float(policy.samples) * variance,  # int32 holds too few
+        count=obs.count + policy.samples,
     )
     return fresh.replace(
         params=fresh.params._replace(actor=policy.train.params.actor),

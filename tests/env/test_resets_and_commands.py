@@ -441,6 +441,22 @@ def test_a_rank_is_won_and_lost(world, robots, walked, commanded, level, cause, 
     assert int(rank) == int(next_level) == expected
 
 
+@pytest.mark.parametrize("walked", [-0.001, 0.001])
+def test_who_is_told_to_stand_all_the_time_keeps_the_rank(world, robots, walked):
+    over = Ending(*(jnp.array(name == "timeout") for name in Ending._fields))
+    state = one(robots).replace(
+        rank=jnp.int32(1),
+        level=jnp.int32(1),
+        commanded=jnp.float32(0.0),
+        command=jnp.zeros(3),
+        is_steered=jnp.array(False),
+        step=jnp.int32(1000),
+    )
+    state = put(state, x=state.start[0] + walked)
+    rank, _ = curriculum.next_level(world, state, over, jax.random.key(0))
+    assert int(rank) == 1
+
+
 def test_a_lane_is_only_passed_from_its_start(world, robots):
     over = Ending(*(jnp.array(name == "finished") for name in Ending._fields))
     state = put(on("gap", one(robots)), x=11.0).replace(

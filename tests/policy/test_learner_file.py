@@ -12,6 +12,7 @@ from cref_jax import config
 from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, sources, warm_start
 from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.ppo import normalization
 from cref_jax.training import iteration
 
 
@@ -64,8 +65,24 @@ def test_a_policy_of_billions_of_samples_begins_another_training(small, tmp_path
     began = warm_start.start_from_policy(fresh, policy)
     found = began.statistics.obs
     assert int(found.count) == policy.samples
-    variance = np.square(policy.train.statistics.obs.std)
-    np.testing.assert_allclose(found.summed_variance, policy.samples * variance, rtol=1e-6)
+    std = policy.train.statistics.obs.std
+    np.testing.assert_array_equal(found.std, std)
+    np.testing.assert_allclose(
+        found.summed_variance, policy.samples * (np.square(std) - 1e-4), rtol=1e-6
+    )
+
+
+def test_a_first_update_at_the_mean_leaves_the_deviations_of_a_policy_as_they_were(small, tmp_path):
+    policy = learned(small, tmp_path / "learned.npz")._replace(samples=10**9)
+    fresh = iteration.initial_state(small).train
+    obs = policy.train.statistics.obs
+    narrow = obs.replace(std=jnp.full_like(obs.std, 0.02))  # the variance's floor is 0.01^2
+    statistics = policy.train.statistics._replace(obs=narrow)
+    policy = policy._replace(train=policy.train.replace(statistics=statistics))
+    before = warm_start.start_from_policy(fresh, policy).statistics.obs
+    seen = jnp.broadcast_to(before.mean, (4, 2, before.mean.size))
+    after = normalization.update_statistics(before, seen, jnp.ones((4, 2), bool))
+    np.testing.assert_allclose(after.std, before.std, rtol=1e-5)
 
 
 def test_a_policy_is_summarized_as_it_is_described(small, tmp_path):
