@@ -53,6 +53,7 @@ class PPO:
     lam: float = 0.95
     learning_rate: float = 1e-3
     learning_rate_range: tuple[float, float] = (1e-5, 1e-2)
+    critic_learning_rate: float = 0.0  # fixed, where the KL lowers the actor's; 0: the actor's
     target_kl: float = 0.01
     max_gradient_norm: float = 1.0
     average: int = 200  # iterations, at most, over which the kept policy is averaged; assumed

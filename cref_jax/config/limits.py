@@ -212,6 +212,7 @@ RANGES: Ranges = {
         "lam": SHARE,
         "learning_rate": Within(1e-8, 1),
         "learning_rate_range": Rising(1e-8, 1),
+        "critic_learning_rate": Within(0, 1),
         "target_kl": Within(1e-6, 10),
         "max_gradient_norm": Within(1e-6, 1e6),
         "average": Within(0, 1_000_000),

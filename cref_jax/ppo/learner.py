@@ -122,7 +122,7 @@ def _apply_gradients(
     """Take one step of the optimiser at the rate adapted to the KL.
 
     In the first `critic_first` iterations, actor and rate do not change; the actor then starts at
-    the lowest rate.
+    the lowest rate. The critic has its own, which no KL lowers, if `critic_learning_rate` says so.
     """
     before = optax.tree.get(state.opt_state, "learning_rate")
     rate = adapt_learning_rate(before, losses.kl, c)
@@ -135,6 +135,9 @@ def _apply_gradients(
     changes, opt_state = optimizer(c).update(grads, opt_state, state.params)
     if c.critic_first:  # the optimiser may have come with momentum
         changes = changes._replace(actor=hold(changes.actor))
+    if c.critic_learning_rate:  # Adam's step is proportional to its rate
+        own = jax.tree.map(lambda x: x * (c.critic_learning_rate / rate), changes.critic)
+        changes = changes._replace(critic=own)
     state = state.replace(params=optax.apply_updates(state.params, changes), opt_state=opt_state)
     return state, losses._replace(
         gradient_norm=optax.tree.norm(grads),

@@ -493,6 +493,24 @@ def test_the_critic_alone_learns_first_and_the_actor_begins_at_the_lowest_rate()
     assert not same(critics[0], critics[1]) and not same(critics[1], critics[2])
 
 
+def test_a_critic_with_a_rate_of_its_own_takes_steps_of_it_and_the_actor_none_other():
+    one = dataclasses.replace(C, epochs=1, minibatches=1)
+    state = ppo.initial_state(initial_params(), OBS, CRITIC_OBS, one)
+    moved = {}
+    for own in (0.0, 1e-5):
+        c = dataclasses.replace(one, critic_learning_rate=own)
+        after, losses = ppo.update(state, some_rollout(), KEY, c, NETWORKS)
+        largest = lambda a, b: max(
+            float(jnp.abs(x - y).max())
+            for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+        )
+        moved[own] = largest(after.params.critic, state.params.critic)
+        # Adam's first step is the rate itself
+        actors = largest(after.params.actor, state.params.actor)
+        np.testing.assert_allclose(actors, losses.learning_rate[0, 0], rtol=1e-2)
+    np.testing.assert_allclose([moved[0.0], moved[1e-5]], [C.learning_rate, 1e-5], rtol=1e-2)
+
+
 def test_the_actor_waits_for_the_critic_though_its_optimiser_has_momentum():
     moving, _ = update(initial_state(), some_rollout(), KEY)
     c = dataclasses.replace(C, critic_first=2)
