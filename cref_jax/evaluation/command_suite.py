@@ -11,6 +11,7 @@ from rich.table import Table
 
 from cref_jax import geometry, ppo
 from cref_jax.config import Config
+from cref_jax.env import observations
 from cref_jax.env.world import World, make_world
 from cref_jax.evaluation import protocol, trials
 from cref_jax.physics.simulation import Physics
@@ -171,5 +172,7 @@ def _set_command(robots: rollout.Robots, command: Float[Array, "E 3"]) -> rollou
     """Set the robots' command, in their state and in their observation."""
     env = robots.env.replace(command=command, is_steered=jnp.zeros(len(command), bool))
     observation = robots.observation
-    obs = observation.proprioception.at[:, 6:9].set(command)
-    return robots.replace(env=env, observation=observation._replace(proprioception=obs))
+    obs = observation.proprioception
+    where = observations.slices(observations.num_joints_of(obs.shape[1]))["command"]
+    told = observation._replace(proprioception=obs.at[:, where].set(command))
+    return robots.replace(env=env, observation=told)

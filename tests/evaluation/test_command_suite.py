@@ -1,9 +1,15 @@
 """What is said of robots that were told to stand, walk and stop: traces made by hand."""
 
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cref_jax import config
+from cref_jax import config, ppo
+from cref_jax.env import observations
+from cref_jax.env.observations import Observation
 from cref_jax.evaluation import command_suite
 from cref_jax.evaluation.command_suite import CommandTrace
 
@@ -57,6 +63,47 @@ def test_a_robot_stops_where_it_is_at_the_end():
     speed = np.where(np.arange(STEPS) < 275, 0.6, 0.0)  # in steps of which the 250th is the first
     found = command_suite.summarize_stop(trace(speed), PERIOD)
     assert found["distance_m"] == pytest.approx(0.3, abs=1e-9) and found["fell"] == 0
+
+
+def test_a_trace_has_the_motion_in_the_robots_frame_and_the_command_until_the_stop(
+    world, robots, monkeypatch
+):
+    heard = []
+
+    def step_policy(world, train, walking):
+        heard.append((walking.env.command, walking.observation.proprioception))
+        qpos = walking.env.body.qpos.at[:, :2].add(1.0)
+        body = walking.env.body._replace(qpos=qpos)
+        none = jnp.zeros((8, 2), bool)
+        outcome = SimpleNamespace(
+            ending=SimpleNamespace(terminated=walking.env.command[:, 0] == 0.0),
+            measures=SimpleNamespace(touchdown=none, airborne=~none),
+        )
+        return walking.replace(env=walking.env.replace(body=body)), None, outcome
+
+    monkeypatch.setattr(command_suite.rollout, "step_policy", step_policy)
+    # it faces left, and moves by 0.3 m/s ahead while it turns by 0.7 rad/s
+    half = np.sqrt(0.5)
+    body = robots.body._replace(
+        qpos=robots.body.qpos.at[:, 3:7].set(jnp.array([half, 0.0, 0.0, half])),
+        qvel=jnp.zeros_like(robots.body.qvel).at[:, :6].set(jnp.array([0, 0.3, 0, 0.1, 0.2, 0.7])),
+    )
+    obs = Observation(jnp.full((8, 45), 9.0), jnp.zeros((8, 1)), jnp.zeros((8, 3)))
+    start = command_suite.rollout.Robots(robots.replace(body=body), obs, (), jnp.zeros(8, bool))
+    commands = jnp.tile(jnp.array([0.6, 0.1, -0.2]), (8, 1))
+    record = command_suite._record_trace.__wrapped__
+    with jax.disable_jit():
+        seen = record(world, ppo.TrainState(*5 * [None]), start, commands, jnp.full(8, 2), 3)
+    np.testing.assert_allclose(seen.velocity, np.tile([0.3, 0.0, 0.7], (3, 8, 1)), atol=1e-6)
+    np.testing.assert_allclose(np.diff(seen.position, axis=0), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(seen.fallen[:, 0], [False, False, True])
+    assert np.asarray(seen.airborne).all() and not np.asarray(seen.touchdown).any()
+    for k, (command, told) in enumerate(heard):
+        wanted = [0.6, 0.1, -0.2] if k < 2 else [0.0, 0.0, 0.0]
+        np.testing.assert_allclose(command[0], wanted, atol=1e-6)
+        where = observations.slices(12)["command"]
+        np.testing.assert_allclose(told[0, where], wanted, atol=1e-6)
+        assert (np.delete(told[0], np.r_[where]) == 9.0).all()
 
 
 @pytest.mark.parametrize(("asked", "length"), [(8.0, 16.0), (20.0, 20.0)])

@@ -59,6 +59,16 @@ def test_what_comes_after_a_fall_does_not_count():
     assert walk.sideways == pytest.approx({"drift_m": 0.2, "largest_m": 0.2, "worst_m": 0.3})
 
 
+def test_feet_after_a_fall_count_neither_as_steps_nor_as_air():
+    # one robot falls after 4 of 8 steps: its left foot is up in two of them, and comes down once
+    up = np.array([0, 1, 1, 0, 1, 0, 1, 0], bool)
+    airborne = np.stack([up, up & (np.arange(8) > 3)], axis=-1)[:, None]
+    alive = (np.arange(8) < 4)[:, None]
+    walk = _summarize(ending(1, low=[True]), trace(alive, 0.0, airborne), Config())
+    assert walk.airborne == (0.5, 0.0)
+    assert walk.step_seconds == pytest.approx(2 * 4 * 0.02 / 1)
+
+
 def test_pooled_episodes_add_up_and_pooled_figures_are_means():
     feet = np.zeros((4, 2, 2), bool)
     feet[:2, :, 0] = True  # the left foot is up half of the time
@@ -117,6 +127,17 @@ def test_a_size_is_said_in_its_unit(kind, size, begin):
     outcome = crossing.LaneResult(kind, size, 10, 9, {"low": 1}, 17.0, 0.6)
     assert outcome.line().startswith(begin)
     assert outcome.line().endswith("failures: 1 low")
+
+
+def test_the_time_of_a_crossing_is_that_of_those_who_cross(world, monkeypatch):
+    ending = np.array([0, 0, trials.ENDINGS.index("low")])
+    one, seconds = np.ones(3), np.array([10.0, 14.0, 3.0])
+    outcomes = trials.Trials(one, ending, seconds, 0.5 * one, one, one)
+    monkeypatch.setattr(crossing.trials, "run", lambda *_: outcomes)
+    monkeypatch.setattr(crossing, "crossing_world", lambda *_: world)
+    train = policy("blind").train
+    found = crossing.cross(world.config, world.physics, train, "gap", 0.3, 3)
+    assert (found.successes, found.seconds) == (2, 12.0)
 
 
 def test_where_nobody_succeeds_there_is_no_time_and_the_record_is_json(world, monkeypatch):

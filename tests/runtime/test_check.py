@@ -56,6 +56,7 @@ def test_of_a_robot_that_stands_nothing_is_odd(tmp_path):
         ("q", lambda q: q + 0.15 * (np.arange(12) == 5), "the soles are"),
         ("qd", lambda v: v + 1.0 * (np.arange(12) == 3), "left_knee_joint turns by +1.00"),
         ("now", lambda t: 1.5 * t, "a step every 0.03 s"),
+        ("now", lambda t: t + 0.015 * (round(50 * t) % 7 == 0), "ms early or late"),
         ("stamp", lambda t: t - 5.0, "5.02 s old"),
         ("frame", lambda f: f[::-1], "looks down by"),
         ("frame", lambda f: f + 9.0, "0 % of the pixels"),

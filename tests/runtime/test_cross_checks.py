@@ -5,7 +5,7 @@ import pytest
 from tiny_policy import ROBOT, J, contents, policy
 
 from cref_jax.deploy import Status
-from cref_jax.runtime.cross_checks import CrossChecks
+from cref_jax.runtime.cross_checks import FROZEN_STEPS, CrossChecks
 from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.senses import Senses
@@ -196,3 +196,24 @@ def test_joint_angles_that_are_impossible_once_make_no_wrong_sense_right(legs):
     senses.reset()
     again = zip(*motion(), strict=True)
     assert {senses.take([w, g, w, q, qd], q) for w, g, q, qd, _ in again} == {Status.OK}
+
+
+@pytest.mark.parametrize(
+    ("which", "found"),
+    [
+        (0, Status.GYRO_WRONG),  # gravity turns
+        (1, Status.GRAVITY_WRONG),  # the gyro tells of a turn
+        (2, Status.JOINTS_MIXED_UP),  # the targets move
+        (3, Status.JOINT_SPEEDS_WRONG),  # the joints move
+        (None, Status.OK),
+    ],
+)
+def test_a_sense_that_says_the_same_while_another_tells_of_motion_is_frozen(legs, which, found):
+    senses = list(motion())
+    if which is not None:
+        senses[which] = np.broadcast_to(senses[which][0], senses[which].shape)
+    checks = CrossChecks(PERIOD, J, legs)
+    for k in range(FROZEN_STEPS + 1):
+        assert checks._judge_frozen() == Status.OK
+        checks.compare(*(x[k] for x in senses))
+    assert checks._judge_frozen() == found
