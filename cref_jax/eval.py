@@ -61,9 +61,9 @@ class Options(cli.DebugOption):
     """a robot by name: its newest run (default: any); another robot's is an error"""
     suite: Suite | None = None
     """table: the twelve cells of Table II and the failures of Table III; robust: the same with
-    masses, friction, motors, delays, sensors, pushes and camera mount randomised, and with each of
-    these alone; ood: twenty scenes outside the training distribution, in MuJoCo C by the numpy
-    runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
+    masses, friction, motors, delays, sensors, pushes, camera mount, structures in view and faults
+    of depth randomised, and with each of these alone; ood: twenty scenes outside the training
+    distribution, in MuJoCo C by the numpy runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
     to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping; gate: the
     highway gate by terrain, contact phase and posture (default: walk for a policy of flat ground,
     table for all others)"""
@@ -74,7 +74,7 @@ class Options(cli.DebugOption):
     """trials per cell, episodes or robots (default: 100 on a CPU, 2000 on an accelerator; 10 per
     scene)"""
     stress: Annotated[int, Within(0, 1000)] = 2
-    """trials per scene under each condition: bad frames of each kind, a wider view, friction"""
+    """trials per scene under each condition: bad frames of each kind, a narrower view, friction"""
     film: str | None = None
     """film one trial in this scene instead of evaluating in all: SCENE.mp4"""
     films: Annotated[int, Within(0, 20)] = 3

@@ -118,7 +118,7 @@ def proprioception(
 def height_scan(
     ground: terrain.Terrain, qpos: Float[Array, " Q"], c: config.Scan
 ) -> Float[Array, " M"]:
-    """m_t: height of the base above a grid of ground points around it, m, less the nominal 0.6."""
+    """m_t: height of the base above a grid of ground points around it, less `base_height`, m."""
     x, y = np.meshgrid(np.linspace(*c.x), np.linspace(*c.y), indexing="ij")
     return _clearance(ground, qpos, x.ravel(), y.ravel(), c)
 

@@ -28,7 +28,7 @@ X2_ULTRA = Description(
     kept_clear=("pelvis", "torso", "head_pitch", "hip_yaw"),
     base_height=0.62,
     base_above_ankles=0.55,  # Table I
-    # assumed: a foot comes down on a box of 40 cm when the pelvis is still 0.3 m above the box
+    # assumed: a foot comes down on a box of 40 cm when the pelvis is still 0.23 m above the box
     fallen_below=0.15,
     feet_apart=0.27,  # Table I
     sole_x=(-0.06, 0.13, 5),
