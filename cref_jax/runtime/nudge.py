@@ -36,6 +36,7 @@ class Nudge:
         self._steps = round(SWING / period) + AFTER
         pitches, rolls = legs.turning_about(1), legs.turning_about(0)
         self._rolls = rolls
+        self._can_yaw = all(legs.turning_about(2))
         self.possible = len(pitches) == 2 and all(len(leg) > 2 for leg in pitches)
         self.possible &= all(len(leg) > 0 for leg in rolls)
         self._swing = np.zeros(len(joints.names), np.float32)  # rad
@@ -93,7 +94,7 @@ class Nudge:
         if min(roll) < AGAINST:
             names = " or ".join(self._names[j] for j in self._rolls[int(np.argmin(roll))])
             self.detail = f"the sign of {names} is wrong"
-        elif both_stand and _correlate(np.diff(apart), turn[:, 2], LEAST_TURN) > OTHER_SIDE:
+        elif both_stand and self._turns_against(np.diff(apart), turn[:, 2]):
             self.detail = "the legs are exchanged: the base turns the other way than their hips"
         elif both_stand and self._follow(apart) < UNFOLLOWED:
             self.detail = "the legs are exchanged: one does what is asked of the other"
@@ -103,6 +104,13 @@ class Nudge:
         """Compute the share of the swing that the targets have in a step, -1 to 1."""
         phase = step * self._period / SWING
         return float(np.sin(2.0 * np.pi * phase)) if 0.0 < phase < 1.0 else 0.0
+
+    def _turns_against(self, apart: np.ndarray, yaw: np.ndarray) -> bool:
+        """Check whether the base yaws against the hips, from their and its changes, rad.
+
+        Without yaw joints it is feet which slip that turn the base, and they do so either way.
+        """
+        return self._can_yaw and _correlate(apart, yaw, LEAST_TURN) > OTHER_SIDE
 
     def _follow(self, apart: np.ndarray) -> float:
         """Correlate the swing with how far the hips are apart, less their steady sinking."""

@@ -146,6 +146,17 @@ def test_a_robot_that_is_not_held_on_both_feet_says_nothing(legs):
     assert swing(legs, gyro=lambda w: w * [1, 1, -1], sinks=0.04).judge() == Status.OK
 
 
+def test_legs_without_a_yaw_joint_may_turn_either_way():
+    manifest = contents(policy("full"))[0]
+    for leg in manifest["legs"]:
+        del leg["joints"][HIP_YAW]
+    legs = Legs(Table(manifest, "manifest"), ROBOT.joint_names)
+    for way in (1, -1):
+        assert swing(legs, gyro=lambda w, way=way: w * [1, 1, way]).judge() == Status.OK
+    exchanged = swing(legs, act=lambda q: q[OTHER_LEG])
+    assert exchanged.judge() == Status.JOINTS_MIXED_UP and "asked of the other" in exchanged.detail
+
+
 def test_half_a_swing_says_nothing(legs):
     nudge = swing(legs, gyro=lambda w: w * [1, 1, -1])
     nudge._q, nudge._w = nudge._q[:6], nudge._w[:6]
