@@ -69,6 +69,10 @@ def _of_names(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     for sole in robot.soles:
         if not any(name.startswith(sole) for name in spheres):
             yield f"there is no sphere whose name begins with '{sole}'"
+    for what in ("feet", "soles", "hands"):
+        left, right = getattr(robot, what)
+        if not left.startswith("left_") or right != _other_side(left):
+            yield f"{what} must be named left_ first and then right_, not '{left}', '{right}'"
     both = set().union(*names.values()) | {joint.name for joint in spec.joints}
     for name in sorted(both):
         for side, other in (("left_", "right_"), ("right_", "left_")):
@@ -85,6 +89,9 @@ def _of_roles(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
             yield f"no joint is a '{kind}' of the nominal pose"
     if not any(robot.is_leg(joint) for joint in joints):
         yield f"no joint is one of the legs, {', '.join(robot.legs)}"
+    for joint in joints:
+        if robot.is_leg(joint) and _other_side(joint) == joint:
+            yield f"'{joint}' is one of the legs, and must begin with left_ or right_"
     ranks = [0 if robot.is_leg(j) else 1 if robot.is_waist(j) else 2 for j in joints]
     for joint, rank, before in zip(joints[1:], ranks[1:], ranks, strict=False):
         if rank < before:

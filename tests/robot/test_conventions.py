@@ -204,12 +204,24 @@ def test_the_base_comes_first():
         ({"ankle_x": ("ankle_x",)}, "no joint has 'ankle_x' in its name"),
         ({"kept_clear": ("pelvis", "belly")}, "no capsule has 'belly' in its name"),
         ({"hands": ("left_hand", "right_hand")}, "there is no body 'left_hand'"),
+        ({"feet": X2.feet[::-1]}, "feet must be named left_ first and then right_, not 'right_"),
+        ({"soles": (X2.soles[0],) * 2}, "soles must be named left_ first and then right_"),
+        ({"hands": (X2.hands[0], X2.feet[1])}, "hands must be named left_ first and then right_"),
     ],
 )
 def test_a_role_of_no_part_is_named(role, says):
     spec = mujoco.MjSpec.from_file(str(X2.xml))
     with pytest.raises(ConfigError, match=says):
         check_conventions(spec, dataclasses.replace(X2, **role))
+
+
+def test_a_leg_joint_without_a_side_is_named():
+    spec = mujoco.MjSpec.from_file(str(X2.xml))
+    for joint in ("left_knee_joint", "right_knee_joint"):
+        other = joint.replace("left_", "l_").replace("right_", "r_")
+        spec.joint(joint).name = spec.actuator(joint).target = other
+    with pytest.raises(ConfigError, match="'l_knee_joint' is one of the legs, and must begin with"):
+        check_conventions(spec, X2)
 
 
 def test_an_unknown_robot_is_refused_with_the_nearest_name():
