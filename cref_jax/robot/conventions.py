@@ -42,6 +42,7 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     yield from _of_motors(spec, [joint.name for joint in joints[1:]])
     yield from _of_names(spec, robot)
     yield from _of_roles(spec, robot)
+    yield from _of_soles(spec, robot)
     yield from _of_contacts(spec)
     yield from _of_mirror_images(spec, robot)
 
@@ -104,6 +105,22 @@ def _of_roles(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
         for name in names:
             if not any(name in part for part in parts):
                 yield f"no {what} has '{name}' in its name"
+
+
+def _of_soles(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
+    """Yield a complaint about each sphere of a sole that moves with another link than the foot."""
+    for foot, sole in zip(robot.feet, robot.soles, strict=True):
+        for geom in spec.geoms:
+            is_sole = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name.startswith(sole)
+            if is_sole and _moved(geom.parent).name != foot:
+                yield f"'{geom.name}' must be on '{foot}' itself: a toe joint is not supported"
+
+
+def _moved(body: mujoco.MjsBody) -> mujoco.MjsBody:
+    """Find the body with a joint that this one is fixed to, or the world."""
+    while not body.joints and body.parent:
+        body = body.parent
+    return body
 
 
 def _of_contacts(spec: mujoco.MjSpec) -> Iterator[str]:

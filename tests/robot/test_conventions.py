@@ -48,6 +48,21 @@ def without_a_sole(spec):
         geom.name = geom.name.replace("sole", "tread")
 
 
+def with_a_sole_on_another_link(spec):
+    spec.delete(spec.geom("left_sole_0"))
+    spec.body("left_ankle_pitch_link").add_geom(
+        name="left_sole_0", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0.0, 0.0]
+    )
+
+
+def with_soles_on_the_other_foot(spec):
+    for geom in [g for g in spec.geoms if "_sole_" in g.name]:
+        geom.name = f"other_{geom.name}"
+    for geom in [g for g in spec.geoms if "_sole_" in g.name]:
+        side = "left" if "right" in geom.name else "right"
+        geom.name = f"{side}_sole_{geom.name[-1]}"
+
+
 def with_a_lighter_shank(spec):
     spec.body("left_knee_link").mass = 1.5
 
@@ -140,6 +155,8 @@ def test_every_robot_keeps_the_conventions(name):
         (without_a_torque_limit, "actuator of 'left_knee_joint' must be a position one"),
         (without_a_camera, "there is no site 'depth_camera'"),
         (without_a_sole, "there is no sphere whose name begins with 'left_sole'"),
+        (with_a_sole_on_another_link, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
+        (with_soles_on_the_other_foot, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
         (with_a_lighter_shank, "'right_knee_link' must be the mirror image of the left one"),
         (with_another_range, "'right_hip_roll_joint' must have the mirrored axis and range"),
         (with_a_knee_that_turns_the_other_way, "'right_knee_joint' must turn the other way"),
@@ -187,6 +204,20 @@ def test_bodies_that_weigh_what_their_shapes_do_are_compared():
     other.body(BIPED.hands[1]).geoms[0].mass = 0.3
     with pytest.raises(ConfigError, match=f"'{BIPED.hands[1]}' must be the mirror image of the"):
         check_conventions(other, BIPED)
+
+
+def test_a_sole_may_be_fixed_to_its_foot():
+    spec = mujoco.MjSpec.from_file(str(BIPED.xml))
+    for foot in BIPED.feet:
+        pad = spec.body(foot).add_body(name=foot.replace("ankle_roll", "pad"))
+        for sole in [g for g in spec.geoms if g.parent.name == foot and "sole" in g.name]:
+            name, place, size = sole.name, sole.pos.copy(), sole.size.copy()
+            spec.delete(sole)
+            pad.add_geom(
+                name=name, pos=place, size=size, type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                mass=0.0, contype=0, conaffinity=0,
+            )  # fmt: skip
+    check_conventions(spec, BIPED)
 
 
 def test_the_base_comes_first():
