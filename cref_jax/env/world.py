@@ -9,7 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from cref_jax import robot as robots
 from cref_jax import terrain
-from cref_jax.config import Config, describe_unknown
+from cref_jax.config import Config, Randomisation, describe_unknown
 from cref_jax.errors import ConfigError
 from cref_jax.physics.records import Body, EngineName
 from cref_jax.physics.simulation import Physics, resolve_engine
@@ -33,11 +33,23 @@ def make_world(c: Config, physics: Physics) -> World:
     """Build the terrain and settle the states that episodes start from.
 
     Raises:
-        ConfigError: the terrain is unknown, or its numbers or those of the starts cannot be used.
+        ConfigError: the terrain is unknown, or its numbers, those of the starts or the robot's
+            payload cannot be used.
     """
     c, atlas = robots.fill_in(c), lanes.build(c.terrain)
+    _check_payload(c.randomisation, physics)
     _check_lanes(c, atlas)
     return World(c, physics, atlas, _settle_robots(c, physics))
+
+
+def _check_payload(c: Randomisation, physics: Physics) -> None:
+    """Refuse payloads of which a negative one would leave nothing of the trunk."""
+    trunk = float(physics.model.body_mass[physics.robot.trunk])
+    if c.enabled and c.trunk_mass >= trunk:
+        raise ConfigError(
+            f"--randomisation.trunk-mass must be below {trunk:.3g} kg, what the robot's trunk "
+            f"weighs, not {c.trunk_mass:g}"
+        )
 
 
 def _check_lanes(c: Config, atlas: Atlas) -> None:

@@ -26,3 +26,10 @@ def test_lanes_and_starts_that_do_not_go_together_are_refused(world, changes, sa
     c = config.override(small_world.C, changes)
     with pytest.raises(ConfigError, match=says):
         make_world(c, world.physics)
+
+
+def test_a_payload_that_outweighs_the_trunk_is_refused(world):
+    # the X2's torso weighs 10.14 kg
+    c = config.override(small_world.C, {"randomisation": {"trunk_mass": 10.2}})
+    with pytest.raises(ConfigError, match=r"trunk-mass must be below 10.1 kg, .* not 10.2"):
+        make_world(c, world.physics)
