@@ -13,6 +13,7 @@ from cref_jax.robot.description import Description
 MIRRORED = 1e-4  # m, rad, kg or the like by which mirror images may differ, as rounded figures do
 INERTIA = 1e-2  # of its trace, by which an inertia may; assumed: small ones have few digits
 ASIDE = 5e-3  # m, of a centre of mass in the middle; assumed: trunks carry a little on one side
+GRAVITY = (0.0, 0.0, -9.81)  # m/s^2; MuJoCo's own
 POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
 
@@ -35,24 +36,43 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     for joint in joints[1:]:
         if joint.type != hinge or any(joint.pos):
             yield f"'{joint.name}' must be a hinge about its body's origin"
-        if not joint.range[0] < joint.range[1]:
-            yield f"'{joint.name}' must have a range"
         if not len(joint.userdata) or not joint.userdata[0] > 0.0:
             yield f"'{joint.name}' must have its speed limit, rad/s, as the first value of user"
-    yield from _of_motors(spec, [joint.name for joint in joints[1:]])
+    if [motor.target for motor in spec.actuators] != [joint.name for joint in joints[1:]]:
+        yield "actuators must be one per joint, in the joints' order"
     yield from _of_names(spec, robot)
     yield from _of_roles(spec, robot)
     yield from _of_soles(spec, robot)
     yield from _of_contacts(spec)
-    yield from _of_mirror_images(spec, robot)
+    model = spec.copy().compile()  # with what the compiler works out, such as masses of shapes
+    yield from _of_physics(model)
+    yield from _of_mirror_images(spec, model, robot)
 
 
-def _of_motors(spec: mujoco.MjSpec, joints: list[str]) -> Iterator[str]:
-    if [motor.target for motor in spec.actuators] != joints:
-        yield "actuators must be one per joint, in the joints' order"
-    for motor in spec.actuators:
-        if not motor.gainprm[0] > 0.0 or not motor.forcerange[1] > 0.0:
-            yield f"the actuator of '{motor.target}' must be a position one with kp and forcerange"
+def _of_physics(model: mujoco.MjModel) -> Iterator[str]:
+    """Yield complaints about joints, motors and gravity that are not as training computes them."""
+    for number in range(1, model.njnt):
+        name = model.joint(number).name
+        if not model.jnt_limited[number]:
+            yield f"'{name}' must have a range"
+        if model.qpos0[model.jnt_qposadr[number]] or model.jnt_actfrclimited[number]:
+            yield f"'{name}' must have neither ref nor actuatorfrcrange"
+        if not _is_servo(model, number - 1):
+            yield f"the actuator of '{name}' must be a position one with kp, kv, forcerange alone"
+    if not np.array_equal(model.opt.gravity, GRAVITY):
+        yield "gravity must be 0 0 -9.81"
+
+
+def _is_servo(model: mujoco.MjModel, motor: int) -> bool:
+    """Check that a motor's torque is kp (target - q) - kd qd, within limits that are the same."""
+    kp, least, most = model.actuator_gainprm[motor, 0], *model.actuator_forcerange[motor]
+    offset, slope, damping = model.actuator_biasprm[motor, :3]
+    kinds = [model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype]
+    servo = [mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE, mujoco.mjtDyn.mjDYN_NONE]
+    is_bare = model.actuator_gear[motor, 0] == 1.0 and not model.actuator_ctrllimited[motor]
+    is_limited = model.actuator_forcelimited[motor] and most == -least
+    is_damped = kp > 0.0 and (offset, slope) == (0.0, -kp) and damping < 0.0
+    return all([is_bare, is_limited, is_damped, [kind[motor] for kind in kinds] == servo])
 
 
 def _of_names(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
@@ -137,12 +157,10 @@ def _of_contacts(spec: mujoco.MjSpec) -> Iterator[str]:
             yield f"it must have no {what}"
 
 
-def _of_mirror_images(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
-    """Yield a complaint about each part whose partner is not its mirror image.
-
-    They are compared as compiled, since a body may have its mass from its shapes alone.
-    """
-    model = spec.copy().compile()
+def _of_mirror_images(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, robot: Description
+) -> Iterator[str]:
+    """Yield a complaint about each part whose partner is not its mirror image."""
     names = [model.body(number).name for number in range(model.nbody)]
     for right, name in enumerate(names):
         other = _other_side(name)
@@ -172,7 +190,7 @@ def _of_joint_pair(
     if robot.nominal_angle(right.name) != np.sign(turn) * robot.nominal_angle(left.name):
         yield f"'{right.name}' must turn the other way: its nominal angle mirrors the left one's so"
     if not _near(_drive(model, left.name, turn), _drive(model, right.name, 1.0)):
-        yield f"'{right.name}' must have the motor, speed, armature and friction of the left one"
+        yield f"'{right.name}' must have the motor, speed, armature, friction, spring of the left"
 
 
 def _other_side(name: str) -> str:
@@ -243,6 +261,7 @@ def _drive(model: mujoco.MjModel, joint: str, turn: float) -> Float[np.ndarray, 
         model.actuator_gainprm[motor], model.actuator_biasprm[motor],
         _turned(model.actuator_forcerange[motor], turn), model.jnt_user[number][:1],
         model.dof_armature[dof], model.dof_damping[dof], model.dof_frictionloss[dof],
+        model.jnt_stiffness[number], turn * model.qpos_spring[model.jnt_qposadr[number]],
     )  # fmt: skip
     return np.concatenate([np.ravel(part) for part in parts])
 

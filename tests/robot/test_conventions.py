@@ -39,6 +39,50 @@ def without_a_torque_limit(spec):
     spec.actuator("left_knee_joint").forcerange = [0.0, 0.0]
 
 
+def with_a_target_limit(spec):
+    spec.actuator("left_knee_joint").ctrlrange = [-0.1, 0.1]
+
+
+def with_a_gear(spec):
+    spec.actuator("left_knee_joint").gear[0] = 50.0
+
+
+def with_a_slow_motor(spec):
+    spec.actuator("left_knee_joint").set_to_position(kp=100.0, kv=2.0, timeconst=0.1)
+
+
+def without_damping(spec):
+    spec.actuator("left_knee_joint").biasprm[2] = 0.0
+
+
+def with_torques_for_targets(spec):
+    spec.actuator("left_knee_joint").set_to_motor()
+
+
+def with_speeds_for_targets(spec):
+    spec.actuator("left_knee_joint").set_to_velocity(kv=2.0)
+
+
+def with_more_torque_one_way(spec):
+    spec.actuator("left_knee_joint").forcerange = [-5.0, 40.0]
+
+
+def with_a_torque_limit_of_the_joint(spec):
+    spec.joint("left_knee_joint").actfrcrange = [-1.0, 1.0]
+
+
+def with_another_zero(spec):
+    spec.joint("left_knee_joint").ref = 0.3
+
+
+def with_a_spring(spec):
+    spec.joint("right_knee_joint").stiffness[0] = 100.0
+
+
+def without_gravity(spec):
+    spec.option.gravity = [0.0, 0.0, 0.0]
+
+
 def without_a_camera(spec):
     spec.delete(spec.site("depth_camera"))
 
@@ -153,6 +197,23 @@ def test_every_robot_keeps_the_conventions(name):
         (without_speed_limit, "'left_knee_joint' must have its speed limit"),
         (without_a_motor, "actuators must be one per joint, in the joints' order"),
         (without_a_torque_limit, "actuator of 'left_knee_joint' must be a position one"),
+        (with_a_target_limit, "actuator of 'left_knee_joint' must be a position one"),
+        (with_a_gear, "actuator of 'left_knee_joint' must be a position one"),
+        (with_a_slow_motor, "actuator of 'left_knee_joint' must be a position one"),
+        (without_damping, "actuator of 'left_knee_joint' must be a position one"),
+        (with_torques_for_targets, "actuator of 'left_knee_joint' must be a position one"),
+        (with_speeds_for_targets, "actuator of 'left_knee_joint' must be a position one"),
+        (with_more_torque_one_way, "actuator of 'left_knee_joint' must be a position one"),
+        (
+            with_a_torque_limit_of_the_joint,
+            "'left_knee_joint' must have neither ref nor",
+        ),
+        (with_another_zero, "'left_knee_joint' must have neither ref nor actuatorfrcrange"),
+        (
+            with_a_spring,
+            "'right_knee_joint' must have the motor, speed, armature, friction",
+        ),
+        (without_gravity, "gravity must be 0 0 -9.81"),
         (without_a_camera, "there is no site 'depth_camera'"),
         (without_a_sole, "there is no sphere whose name begins with 'left_sole'"),
         (with_a_sole_on_another_link, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
@@ -171,9 +232,9 @@ def test_every_robot_keeps_the_conventions(name):
         (with_a_heavier_rotor, "'right_knee_joint' must have the motor, speed, armature"),
         (
             with_more_friction,
-            "'right_knee_joint' must have the motor, speed, armature and friction",
+            "'right_knee_joint' must have the motor, speed, armature, friction",
         ),
-        (with_more_damping, "'right_knee_joint' must have the motor, speed, armature and friction"),
+        (with_more_damping, "'right_knee_joint' must have the motor, speed, armature, friction"),
         (with_a_collision, "geom 'pelvis' must have contype and conaffinity 0"),
         (with_a_sensor, "it must have no sensors"),
         (with_one_arm_renamed, "'left_forearm_link' has no 'right_forearm_link'"),
