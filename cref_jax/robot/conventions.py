@@ -1,6 +1,7 @@
 """Whether an MJCF keeps the conventions that the rest of the program relies on."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -17,6 +18,16 @@ GRAVITY = (0.0, 0.0, -9.81)  # m/s^2; MuJoCo's own
 POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
 
+def read(robot: Description) -> mujoco.MjSpec:
+    """Read a robot's MJCF as it is written.
+
+    Raises:
+        ConfigError: there is no such file, or MuJoCo cannot read it.
+    """
+    with _named(robot):
+        return mujoco.MjSpec.from_file(str(robot.xml))
+
+
 def check_conventions(spec: mujoco.MjSpec, robot: Description) -> None:
     """Refuse a model that does not keep the conventions of `description`.
 
@@ -25,6 +36,15 @@ def check_conventions(spec: mujoco.MjSpec, robot: Description) -> None:
     """
     for complaint in _complaints(spec, robot):
         raise ConfigError(f"{robot.xml.name}: {complaint}")
+
+
+@contextmanager
+def _named(robot: Description) -> Iterator[None]:
+    """Turn what MuJoCo says of a model into one line with its file's name."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError(f"{robot.xml.name}: {' '.join(str(error).split())}") from error
 
 
 def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
@@ -42,9 +62,10 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
         yield "actuators must be one per joint, in the joints' order"
     yield from _of_names(spec, robot)
     yield from _of_roles(spec, robot)
-    yield from _of_soles(spec, robot)
+    yield from _of_feet_and_hands(spec, robot)
     yield from _of_contacts(spec)
-    model = spec.copy().compile()  # with what the compiler works out, such as masses of shapes
+    with _named(robot):
+        model = spec.copy().compile()  # with what the compiler works out, such as masses of shapes
     yield from _of_physics(model)
     yield from _of_mirror_images(spec, model, robot)
 
@@ -127,8 +148,12 @@ def _of_roles(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
                 yield f"no {what} has '{name}' in its name"
 
 
-def _of_soles(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
-    """Yield a complaint about each sphere of a sole that moves with another link than the foot."""
+def _of_feet_and_hands(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
+    """Yield complaints about those that no joint moves, and spheres of soles elsewhere."""
+    for what in (*robot.feet, *robot.hands):
+        moved = _moved(spec.body(what))
+        if moved.name != what:
+            yield f"'{what}' has no joint: its Description must name '{moved.name}' instead"
     for foot, sole in zip(robot.feet, robot.soles, strict=True):
         for geom in spec.geoms:
             is_sole = geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and geom.name.startswith(sole)
@@ -146,6 +171,8 @@ def _moved(body: mujoco.MjsBody) -> mujoco.MjsBody:
 def _of_contacts(spec: mujoco.MjSpec) -> Iterator[str]:
     """Yield complaints about what the simulation adds by itself, or has no use for."""
     for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE and not geom.name:
+            yield f"each sphere of '{geom.parent.name}' must have a name"
         if geom.contype or geom.conaffinity:
             yield f"geom '{geom.name}' must have contype and conaffinity 0"
     parts = {

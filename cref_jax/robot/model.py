@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from cref_jax import config
-from cref_jax.robot.conventions import check_conventions
+from cref_jax.robot.conventions import check_conventions, read
 from cref_jax.robot.description import Description
 from cref_jax.robot.registry import describe
 
@@ -147,7 +147,7 @@ def spec(
         ConfigError: there is no such robot, or its MJCF does not keep the conventions.
     """
     data = describe(name)
-    s = mujoco.MjSpec.from_file(str(data.xml))
+    s = read(data)
     check_conventions(s, data)
     for joint in s.joints[1:]:
         if not _moves(data, joint.name, moves):

@@ -107,6 +107,11 @@ def with_soles_on_the_other_foot(spec):
         geom.name = f"{side}_sole_{geom.name[-1]}"
 
 
+def with_two_spheres_without_names(spec):
+    for side in ("left", "right"):
+        spec.geom(f"{side}_sole_0").name = ""
+
+
 def with_a_lighter_shank(spec):
     spec.body("left_knee_link").mass = 1.5
 
@@ -218,6 +223,7 @@ def test_every_robot_keeps_the_conventions(name):
         (without_a_sole, "there is no sphere whose name begins with 'left_sole'"),
         (with_a_sole_on_another_link, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
         (with_soles_on_the_other_foot, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
+        (with_two_spheres_without_names, "each sphere of 'left_ankle_roll_link' must have a name"),
         (with_a_lighter_shank, "'right_knee_link' must be the mirror image of the left one"),
         (with_another_range, "'right_hip_roll_joint' must have the mirrored axis and range"),
         (with_a_knee_that_turns_the_other_way, "'right_knee_joint' must turn the other way"),
@@ -267,7 +273,32 @@ def test_bodies_that_weigh_what_their_shapes_do_are_compared():
         check_conventions(other, BIPED)
 
 
-def test_a_sole_may_be_fixed_to_its_foot():
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (("</worldbody>", ""), "XML parse error"),
+        (("<worldbody>", '<asset><mesh file="no.stl"/></asset><worldbody>'), "no.stl"),
+        (('<inertial mass="0.8"', '<inertial mass="0"'), "mass and inertia of moving bodies must"),
+    ],
+)
+def test_what_mujoco_cannot_read_is_said_in_one_line(monkeypatch, tmp_path, wrong, says):
+    file = tmp_path / "mine.xml"
+    file.write_text(BIPED.xml.read_text().replace(*wrong))
+    monkeypatch.setitem(ROBOTS, "mine", dataclasses.replace(BIPED, xml=file))
+    with pytest.raises(ConfigError, match=says) as error:
+        robot.load(config.Robot("mine"))
+    assert str(error.value).startswith("mine.xml: ") and "\n" not in str(error.value)
+
+
+def test_a_file_that_is_missing_is_named(monkeypatch, tmp_path):
+    absent = dataclasses.replace(BIPED, xml=tmp_path / "mine.xml")
+    monkeypatch.setitem(ROBOTS, "mine", absent)
+    with pytest.raises(ConfigError, match=r"^mine.xml: .*[^\n]*$"):
+        robot.load(config.Robot("mine"))
+
+
+def with_pads():
+    """Return the biped whose soles are on bodies that are fixed to its feet."""
     spec = mujoco.MjSpec.from_file(str(BIPED.xml))
     for foot in BIPED.feet:
         pad = spec.body(foot).add_body(name=foot.replace("ankle_roll", "pad"))
@@ -278,7 +309,18 @@ def test_a_sole_may_be_fixed_to_its_foot():
                 name=name, pos=place, size=size, type=mujoco.mjtGeom.mjGEOM_SPHERE,
                 mass=0.0, contype=0, conaffinity=0,
             )  # fmt: skip
-    check_conventions(spec, BIPED)
+    return spec
+
+
+def test_a_sole_may_be_fixed_to_its_foot():
+    check_conventions(with_pads(), BIPED)
+
+
+@pytest.mark.parametrize("role", ["feet", "hands"])
+def test_the_link_that_a_foot_or_hand_is_fixed_to_is_named_instead(role):
+    pads = dataclasses.replace(BIPED, **{role: ("left_pad_link", "right_pad_link")})
+    with pytest.raises(ConfigError, match=r"'left_pad_link' has no joint: .*'left_ankle_roll_"):
+        check_conventions(with_pads(), pads)
 
 
 def test_the_base_comes_first():
