@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import fields
+from typing import Any, get_args, get_origin
 
 import mujoco
 import numpy as np
@@ -49,6 +50,7 @@ def _named(robot: Description) -> Iterator[None]:
 
 def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
     """Yield complaints about joints, motors, names, roles, contacts and mirror images."""
+    yield from _of_description(robot)
     free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
     joints = list(spec.joints)
     if not joints or joints[0].type != free or joints[0].parent.name != robot.base:
@@ -68,6 +70,16 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
         model = spec.copy().compile()  # with what the compiler works out, such as masses of shapes
     yield from _of_physics(model)
     yield from _of_mirror_images(spec, model, robot)
+
+
+def _of_description(robot: Description) -> Iterator[str]:
+    """Yield a complaint about each field that is a text or of another length than is declared."""
+    for field in fields(robot):
+        value, parts = getattr(robot, field.name), get_args(field.type)
+        if get_origin(field.type) is not tuple:
+            continue
+        if not isinstance(value, tuple) or (... not in parts and len(value) != len(parts)):
+            yield f"{field.name} must be a {field.type}, not {value!r}: one name needs a comma too"
 
 
 def _of_physics(model: mujoco.MjModel) -> Iterator[str]:

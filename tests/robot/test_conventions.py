@@ -1,6 +1,8 @@
 """An MJCF that does not keep a convention is refused in one line that says which."""
 
+import copy
 import dataclasses
+import re
 
 import mujoco
 import numpy as np
@@ -327,6 +329,22 @@ def test_the_base_comes_first():
     spec = mujoco.MjSpec.from_file(str(X2.xml))
     with pytest.raises(ConfigError, match="the first joint must be the free joint of 'torso'"):
         check_conventions(spec, dataclasses.replace(X2, base="torso"))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("hip_xz", "hip_roll", "must be a tuple[str, ...], not 'hip_roll': one name needs a comma"),
+        ("legs", "hip", "must be a tuple[str, ...], not 'hip': one name needs a comma too"),
+        ("feet", X2.feet[0], "must be a tuple[str, str], not 'left_ankle_roll_link'"),
+        ("hands", (), "must be a tuple[str, str], not ()"),
+    ],
+)
+def test_a_name_without_its_comma_is_refused(field, value, says):
+    robot = copy.copy(X2)
+    object.__setattr__(robot, field, value)  # as tests check the types of what is made
+    with pytest.raises(ConfigError, match=re.escape(f"{field} {says}")):
+        check_conventions(mujoco.MjSpec.from_file(str(X2.xml)), robot)
 
 
 @pytest.mark.parametrize(
