@@ -15,6 +15,7 @@ from cref_jax.robot.description import Description
 MIRRORED = 1e-4  # m, rad, kg or the like by which mirror images may differ, as rounded figures do
 INERTIA = 1e-2  # of its trace, by which an inertia may; assumed: small ones have few digits
 ASIDE = 5e-3  # m, of a centre of mass in the middle; assumed: trunks carry a little on one side
+FASTEST = 100.0  # rad/s; assumed: joints of robots reach a third of it
 GRAVITY = (0.0, 0.0, -9.81)  # m/s^2; MuJoCo's own
 POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
@@ -60,6 +61,8 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
             yield f"'{joint.name}' must be a hinge about its body's origin"
         if not len(joint.userdata) or not joint.userdata[0] > 0.0:
             yield f"'{joint.name}' must have its speed limit, rad/s, as the first value of user"
+        elif joint.userdata[0] > FASTEST:
+            yield f"'{joint.name}' must have a speed limit of {FASTEST:g} rad/s at most, not deg/s"
     if [motor.target for motor in spec.actuators] != [joint.name for joint in joints[1:]]:
         yield "actuators must be one per joint, in the joints' order"
     yield from _of_names(spec, robot)
@@ -70,6 +73,7 @@ def _complaints(spec: mujoco.MjSpec, robot: Description) -> Iterator[str]:
         model = spec.copy().compile()  # with what the compiler works out, such as masses of shapes
     yield from _of_physics(model)
     yield from _of_mirror_images(spec, model, robot)
+    yield from _of_pose(model, robot)
 
 
 def _of_description(robot: Description) -> Iterator[str]:
@@ -214,6 +218,15 @@ def _of_mirror_images(
             yield f"a capsule or sphere of '{name}' must be the mirror image of one on the left"
     for right in (joint for joint in spec.joints if joint.name.startswith("right_")):
         yield from _of_joint_pair(model, spec.joint(_other_side(right.name)), right, robot)
+
+
+def _of_pose(model: mujoco.MjModel, robot: Description) -> Iterator[str]:
+    """Yield a complaint about each joint that the nominal pose turns beyond its range."""
+    for number in range(1, model.njnt):
+        name, (low, high) = model.joint(number).name, model.jnt_range[number]
+        angle = robot.nominal_angle(name)
+        if not low <= angle <= high:
+            yield f"'{name}' goes {low:.3g} to {high:.3g} rad, never {angle:g}: is angle='radian'?"
 
 
 def _of_joint_pair(

@@ -33,6 +33,14 @@ def without_speed_limit(spec):
     spec.joint("left_knee_joint").userdata = [0.0]
 
 
+def with_a_speed_in_degrees(spec):
+    spec.joint("left_knee_joint").userdata = [860.0]
+
+
+def with_ranges_in_degrees(spec):
+    spec.compiler.degree = True
+
+
 def without_a_motor(spec):
     spec.delete(spec.actuator("left_knee_joint"))
 
@@ -202,6 +210,12 @@ def test_every_robot_keeps_the_conventions(name):
         (off_its_origin, "'left_knee_joint' must be a hinge about its body's origin"),
         (without_range, "'left_knee_joint' must have a range"),
         (without_speed_limit, "'left_knee_joint' must have its speed limit"),
+        (with_a_speed_in_degrees, "'left_knee_joint' must have a speed limit of 100 rad/s at most"),
+        # -2.704 to 2.556, as degrees
+        (
+            with_ranges_in_degrees,
+            "'left_hip_pitch_joint' goes -0.0472 to 0.0446 rad, never -0.42: is angle='radian'?",
+        ),
         (without_a_motor, "actuators must be one per joint, in the joints' order"),
         (without_a_torque_limit, "actuator of 'left_knee_joint' must be a position one"),
         (with_a_target_limit, "actuator of 'left_knee_joint' must be a position one"),
@@ -351,6 +365,7 @@ def test_a_name_without_its_comma_is_refused(field, value, says):
     ("role", "says"),
     [
         ({"nominal_pose": {"knie": 0.6}}, "no joint is a 'knie' of the nominal pose"),
+        ({"nominal_pose": {"knee": 34.0}}, "'left_knee_joint' goes .* rad, never 34: is angle"),
         ({"legs": ("leg",)}, "no joint is one of the legs, leg"),
         ({"waist": ("head",)}, "'head_yaw_joint' comes too late: the order is legs, waist"),
         ({"ankle_x": ("ankle_x",)}, "no joint has 'ankle_x' in its name"),
