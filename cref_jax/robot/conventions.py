@@ -16,6 +16,7 @@ MIRRORED = 1e-4  # m, rad, kg or the like by which mirror images may differ, as 
 INERTIA = 1e-2  # of its trace, by which an inertia may; assumed: small ones have few digits
 ASIDE = 5e-3  # m, of a centre of mass in the middle; assumed: trunks carry a little on one side
 FASTEST = 100.0  # rad/s; assumed: joints of robots reach a third of it
+TURNED = 0.1  # of a site's axis, nearly rad; assumed: beyond 6 deg it is no alignment
 GRAVITY = (0.0, 0.0, -9.81)  # m/s^2; MuJoCo's own
 POLAR, AXIAL = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of a mirror
 
@@ -221,12 +222,23 @@ def _of_mirror_images(
 
 
 def _of_pose(model: mujoco.MjModel, robot: Description) -> Iterator[str]:
-    """Yield a complaint about each joint that the nominal pose turns beyond its range."""
+    """Yield complaints about joints beyond their range and sites that are turned in that pose."""
+    state = mujoco.MjData(model)
+    state.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     for number in range(1, model.njnt):
         name, (low, high) = model.joint(number).name, model.jnt_range[number]
         angle = robot.nominal_angle(name)
         if not low <= angle <= high:
             yield f"'{name}' goes {low:.3g} to {high:.3g} rad, never {angle:g}: is angle='radian'?"
+        state.qpos[model.jnt_qposadr[number]] = angle
+    mujoco.mj_kinematics(model, state)
+    camera, imu = (state.site(name).xmat.reshape(3, 3) for name in (robot.camera, robot.imu))
+    if not np.allclose(imu, np.eye(3), rtol=0.0, atol=TURNED):
+        yield f"site '{robot.imu}' must have x forward and z up in the nominal pose"
+    down = np.arctan2(-camera[2, 0], camera[0, 0])
+    is_level = np.allclose(camera[:, 1], (0.0, 1.0, 0.0), rtol=0.0, atol=TURNED)
+    if not is_level or min(np.cos([down, down + np.deg2rad(robot.camera_pitch)])) < TURNED:
+        yield f"site '{robot.camera}' must have x forward and z up: camera_pitch comes on top of it"
 
 
 def _of_joint_pair(

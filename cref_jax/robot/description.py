@@ -6,7 +6,7 @@ Conventions of the MJCF, checked by `model.spec` and named in one line where the
 - Names of parts on both sides begin with `left_` and `right_`; the right one is the mirror image.
 - Joints come in the order legs, waist, all others, and actuators in that of the joints.
 - A joint has a range, its speed limit in rad/s as the first value of `user`, and a position
-  actuator with kp, kv and a force range.
+  actuator with kp, kv and a force range alone.
 - Nothing collides by itself, and there are no sensors, keyframes, pairs, equalities or tendons.
 - Spheres, and nothing else, touch the ground; their names begin with the names in `soles` for the
   feet. Capsules are the shapes of links, for depth and for noticing a fall.

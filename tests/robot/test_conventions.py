@@ -1,8 +1,6 @@
 """An MJCF that does not keep a convention is refused in one line that says which."""
 
-import copy
 import dataclasses
-import re
 
 import mujoco
 import numpy as np
@@ -95,6 +93,26 @@ def without_gravity(spec):
 
 def without_a_camera(spec):
     spec.delete(spec.site("depth_camera"))
+
+
+def with_the_imu_turned(spec):
+    spec.site("imu").quat = [0.5**0.5, 0.0, 0.0, 0.5**0.5]
+
+
+def with_the_imu_upside_down(spec):
+    spec.site("imu").quat = [0.0, 1.0, 0.0, 0.0]
+
+
+def with_the_camera_pitched_twice(spec):
+    spec.site("depth_camera").quat = [np.cos(0.436), 0.0, np.sin(0.436), 0.0]  # 50 deg down
+
+
+def with_the_camera_in_its_own_axes(spec):
+    spec.site("depth_camera").quat = [0.5, -0.5, 0.5, -0.5]  # z forward, x to the right
+
+
+def with_the_camera_backwards(spec):
+    spec.site("depth_camera").quat = [0.0, 0.0, 1.0, 0.0]
 
 
 def without_a_sole(spec):
@@ -236,6 +254,11 @@ def test_every_robot_keeps_the_conventions(name):
         ),
         (without_gravity, "gravity must be 0 0 -9.81"),
         (without_a_camera, "there is no site 'depth_camera'"),
+        (with_the_imu_turned, "site 'imu' must have x forward and z up in the nominal pose"),
+        (with_the_imu_upside_down, "site 'imu' must have x forward and z up in the nominal pose"),
+        (with_the_camera_pitched_twice, "site 'depth_camera' must have x forward and z up: camera"),
+        (with_the_camera_in_its_own_axes, "site 'depth_camera' must have x forward and z up"),
+        (with_the_camera_backwards, "site 'depth_camera' must have x forward and z up"),
         (without_a_sole, "there is no sphere whose name begins with 'left_sole'"),
         (with_a_sole_on_another_link, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
         (with_soles_on_the_other_foot, "'left_sole_0' must be on 'left_ankle_roll_link' itself"),
@@ -339,47 +362,10 @@ def test_the_link_that_a_foot_or_hand_is_fixed_to_is_named_instead(role):
         check_conventions(with_pads(), pads)
 
 
-def test_the_base_comes_first():
+def test_a_camera_s_site_may_look_down_a_little():
     spec = mujoco.MjSpec.from_file(str(X2.xml))
-    with pytest.raises(ConfigError, match="the first joint must be the free joint of 'torso'"):
-        check_conventions(spec, dataclasses.replace(X2, base="torso"))
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "says"),
-    [
-        ("hip_xz", "hip_roll", "must be a tuple[str, ...], not 'hip_roll': one name needs a comma"),
-        ("legs", "hip", "must be a tuple[str, ...], not 'hip': one name needs a comma too"),
-        ("feet", X2.feet[0], "must be a tuple[str, str], not 'left_ankle_roll_link'"),
-        ("hands", (), "must be a tuple[str, str], not ()"),
-    ],
-)
-def test_a_name_without_its_comma_is_refused(field, value, says):
-    robot = copy.copy(X2)
-    object.__setattr__(robot, field, value)  # as tests check the types of what is made
-    with pytest.raises(ConfigError, match=re.escape(f"{field} {says}")):
-        check_conventions(mujoco.MjSpec.from_file(str(X2.xml)), robot)
-
-
-@pytest.mark.parametrize(
-    ("role", "says"),
-    [
-        ({"nominal_pose": {"knie": 0.6}}, "no joint is a 'knie' of the nominal pose"),
-        ({"nominal_pose": {"knee": 34.0}}, "'left_knee_joint' goes .* rad, never 34: is angle"),
-        ({"legs": ("leg",)}, "no joint is one of the legs, leg"),
-        ({"waist": ("head",)}, "'head_yaw_joint' comes too late: the order is legs, waist"),
-        ({"ankle_x": ("ankle_x",)}, "no joint has 'ankle_x' in its name"),
-        ({"kept_clear": ("pelvis", "belly")}, "no capsule has 'belly' in its name"),
-        ({"hands": ("left_hand", "right_hand")}, "there is no body 'left_hand'"),
-        ({"feet": X2.feet[::-1]}, "feet must be named left_ first and then right_, not 'right_"),
-        ({"soles": (X2.soles[0],) * 2}, "soles must be named left_ first and then right_"),
-        ({"hands": (X2.hands[0], X2.feet[1])}, "hands must be named left_ first and then right_"),
-    ],
-)
-def test_a_role_of_no_part_is_named(role, says):
-    spec = mujoco.MjSpec.from_file(str(X2.xml))
-    with pytest.raises(ConfigError, match=says):
-        check_conventions(spec, dataclasses.replace(X2, **role))
+    spec.site("depth_camera").quat = [np.cos(0.15), 0.0, np.sin(0.15), 0.0]  # 17 deg, and 50
+    check_conventions(spec, X2)
 
 
 def test_a_leg_joint_without_a_side_is_named():
@@ -389,8 +375,3 @@ def test_a_leg_joint_without_a_side_is_named():
         spec.joint(joint).name = spec.actuator(joint).target = other
     with pytest.raises(ConfigError, match="'l_knee_joint' is one of the legs, and must begin with"):
         check_conventions(spec, X2)
-
-
-def test_an_unknown_robot_is_refused_with_the_nearest_name():
-    with pytest.raises(ConfigError, match="unknown robot 'x2_ultr'; did you mean 'x2_ultra'"):
-        robot.load(config.Robot(name="x2_ultr"))
