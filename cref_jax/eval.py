@@ -61,12 +61,12 @@ class Options(cli.DebugOption):
     """a robot by name: its newest run (default: any); another robot's is an error"""
     suite: Suite | None = None
     """table: the twelve cells of Table II and the failures of Table III; robust: the same with
-    masses, friction, motors, delays, sensors, pushes, camera mount, structures in view and faults
-    of depth randomised, and with each of these alone; ood: twenty scenes outside the training
-    distribution, in MuJoCo C by the numpy runtime; cross: lanes with obstacles of one size; walk: episodes of 20 s on flat ground at 0.4
-    to 0.8 m/s; commands: standing, walking at each speed, sideways, turning, stopping; gate: the
-    highway gate by terrain, contact phase and posture (default: walk for a policy of flat ground,
-    table for all others)"""
+    masses, friction, motors, delays, sensors, pushes, camera mount, structures in view and
+    faults of depth randomised, and with each of these alone; ood: twenty scenes outside the
+    training distribution, in MuJoCo C by the numpy runtime; cross: lanes with obstacles of one
+    size; walk: episodes of 20 s on flat ground at 0.4 to 0.8 m/s; commands: standing, walking
+    at each speed, sideways, turning, stopping; gate: the highway gate by terrain, contact phase
+    and posture (default: walk for a policy of flat ground, table for all others)"""
     kind: Annotated[str, tyro.conf.arg(help=f"kind of lane to cross: {', '.join(KINDS)}")] = "gap"
     size: Annotated[float, Within(0, 100)] = 0.3
     """size of the obstacles, m; for a slope its gradient"""
