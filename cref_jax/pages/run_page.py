@@ -16,6 +16,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.pages import evaluation_page, learning_charts, markup, training_log
 from cref_jax.pages.markup import MISSING, Column, Html, Section, code, join, note, paragraph
 from cref_jax.pages.training_log import Log
+from cref_jax.system import disk
 
 MOST_MEDIA = 12 * markup.MEGABYTE  # bytes of all images and videos per page; assumed: as MOST_VIDEO
 PACKAGES = ("cref-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy", "python")
@@ -55,7 +56,8 @@ def read(folder: Path) -> RunRecord:
     except ConfigError as error:
         reason = str(error)
     steps = sorted(int(p.name) for p in (folder / "checkpoints").glob("*") if p.name.isdecimal())
-    return RunRecord(folder, settings, tuple(_read_starts(folder)), log, reason, tuple(steps))
+    starts = tuple(disk.read_objects(folder / "origin.jsonl"))
+    return RunRecord(folder, settings, starts, log, reason, tuple(steps))
 
 
 def document(run: RunRecord) -> str:
@@ -153,20 +155,6 @@ def _measured_iteration(record: Mapping[str, Any]) -> int | None:
 def format_time(iso: Any) -> str:
     """Format an ISO 8601 time for human readers."""
     return str(iso or MISSING).replace("T", " ").replace("+00:00", " UTC")
-
-
-def _read_starts(folder: Path) -> Iterator[dict[str, Any]]:
-    try:
-        lines = (folder / "origin.jsonl").read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return
-    for line in lines:
-        try:
-            start = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(start, dict):
-            yield start
 
 
 def _make_tiles(run: RunRecord) -> Html:

@@ -13,6 +13,7 @@ from cref_jax import config, deploy, network, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import observations
 from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.system import disk
 from cref_jax.training import distillation
 
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
@@ -204,8 +205,7 @@ def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
     """Describe the origin of the policy; the last start of its run represents all of them."""
     c, origin = policy.config, policy.run / "origin.jsonl"
     stages = distillation.samples_by_stage(c, policy.iteration)
-    lines = origin.read_text().splitlines() if origin.is_file() else []
-    start = json.loads(lines[-1]) if lines else {"command": []}
+    start = [{"command": []}, *disk.read_objects(origin)][-1]
     bare = lambda word: (
         Path(word).name if Path(word).is_absolute() else word
     )  # without private folders

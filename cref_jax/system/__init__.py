@@ -1,1 +1,1 @@
-"""The process around the program: its environment, JAX, signals and worker processes."""
+"""The process around the program: its environment, JAX, signals, worker processes and files."""

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from tensorboardX import SummaryWriter
 
+from cref_jax.system import disk
 from cref_jax.training.wandb_log import WandbLog
 
 PLAIN_SECONDS = 20.0  # between two lines without a terminal
@@ -51,7 +52,8 @@ class Reporter:
         `wandb` are the settings of the run that its log at Weights & Biases shows, if it has one.
         """
         self.console = Console()
-        self._file = (run / "log.jsonl").open("a" if first else "w", encoding="utf-8")
+        path = run / "log.jsonl"
+        self._file = disk.append_lines(path) if first else path.open("w", encoding="utf-8")
         self._board = SummaryWriter(str(run / "tensorboard")) if tensorboard else None
         self._wandb = WandbLog(run, wandb, self.say) if wandb is not None else None
         self._last, self._samples, self._before = last, samples, before - first * samples

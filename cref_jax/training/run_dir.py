@@ -28,6 +28,7 @@ import jax
 from cref_jax.config import Config, presets
 from cref_jax.errors import ConfigError
 from cref_jax.robot.registry import name_robot
+from cref_jax.system import disk
 from cref_jax.terrain import map_files
 from cref_jax.training.checkpoint import Checkpoints
 
@@ -87,7 +88,8 @@ def write_origin(
         **({"map": map_files.digest(Path(terrain))} if map_files.is_map(terrain) else {}),
         **versions(),
     }
-    with (run / "origin.jsonl").open("a" if iteration else "w") as file:
+    path = run / "origin.jsonl"
+    with disk.append_lines(path) if iteration else path.open("w", encoding="utf-8") as file:
         file.write(json.dumps(line) + "\n")
 
 
@@ -153,11 +155,7 @@ def count_samples(run: Path, c: Config, iteration: int) -> int:
 
 
 def _read_starts(run: Path) -> list[dict[str, Any]]:
-    starts: list[dict[str, Any]] = []
-    with contextlib.suppress(OSError, ValueError):  # up to a line that was cut short
-        for line in (run / "origin.jsonl").read_text().splitlines():
-            starts.append(json.loads(line))
-    return starts
+    return disk.read_objects(run / "origin.jsonl")
 
 
 def _read_origin(run: Path, start: int) -> dict[str, Any]:

@@ -86,6 +86,14 @@ def test_samples_are_counted_by_the_robots_of_each_start(tmp_path):
     assert count(50) == (20 * 100 + 30 * 1) * 24
 
 
+def test_a_cut_last_line_loses_that_start_alone(tmp_path):
+    run_dir.write_origin(tmp_path, 0, num_envs=100)
+    with (tmp_path / "origin.jsonl").open("a") as file:
+        file.write('{"iteration": 10, "num_')
+    run_dir.write_origin(tmp_path, 30, num_envs=10)
+    assert run_dir.count_samples(tmp_path, C, 50) == (30 * 100 + 20 * 10) * 24
+
+
 def test_a_start_that_came_to_no_iteration_is_forgotten(tmp_path):
     run_dir.write_origin(tmp_path, 0, engine="mjx")
     run_dir.write_origin(tmp_path, 0, engine="warp")
