@@ -4,6 +4,7 @@ A checkpoint with thousands of robots takes hundreds of megabytes; the learner t
 """
 
 import dataclasses
+import io
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from cref_jax.config import Config, presets
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy.trained import TrainedPolicy, count_samples, learner_shapes
+from cref_jax.system import disk
 from cref_jax.training import pytree_digest
 
 _SETTINGS, _ITERATION, _SAMPLES = "settings", "iterations", "samples"  # not the name of any leaf
@@ -34,10 +36,11 @@ def write(policy: TrainedPolicy, out: Path) -> None:
     arrays[_SETTINGS] = np.array(json.dumps(dataclasses.asdict(policy.config)))
     arrays[_ITERATION] = np.array(policy.iteration)
     arrays[_SAMPLES] = np.array(policy.samples)
+    data = io.BytesIO()
+    np.savez_compressed(data, **arrays)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with out.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        disk.write_all({out: data.getvalue()})
     except OSError as error:
         raise ConfigError(f"cannot write {out}: {error.strerror}") from None
 

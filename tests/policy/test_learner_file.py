@@ -112,3 +112,18 @@ def test_a_file_that_is_something_else_is_refused(small, tmp_path):
     np.savez(path, kernel=np.zeros(3))
     with pytest.raises(ConfigError, match="not written by export --learner"):
         learner_file.read_config(path)
+
+
+def test_a_full_disk_leaves_the_file_before(small, tmp_path, monkeypatch):
+    path = tmp_path / "learned.npz"
+    policy = learned(small, path)
+    learner_file.write(policy, path)
+    before = path.read_bytes()
+
+    def fill_up(file, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(path), "write_bytes", fill_up)
+    with pytest.raises(ConfigError, match=f"cannot write {path}: No space left on device"):
+        learner_file.write(policy._replace(iteration=8), path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
