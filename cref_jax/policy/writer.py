@@ -22,6 +22,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.policy import c_files, reader, reference_vectors, runtime_file
 from cref_jax.policy.manifest import build_manifest
 from cref_jax.policy.trained import TrainedPolicy
+from cref_jax.system import disk
 from cref_jax.training import pytree_digest
 
 ZIPPED = (1980, 1, 1, 0, 0, 0)  # date of every file: equal policies give equal bytes
@@ -68,16 +69,17 @@ def _write_files(
         files |= c_files.write_c(content, weights)
     content["files"] = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
     content["digest"] = deploy.manifest_digest(content)
-    files["manifest.json"] = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+    manifest = (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
+    archive = out.with_name(out.name + ".zip"), _zip_stored({**files, "manifest.json": manifest})
     try:
         out.mkdir(parents=True, exist_ok=True)
+        whole = dict([*((out / name, data) for name, data in files.items()), archive])
+        disk.write_all({**whole, out / "manifest.json": manifest})
         for name in c_files.NAMES:  # of another policy
-            (out / name).unlink(missing_ok=True)
-        for name, data in files.items():
-            (out / name).write_bytes(data)
-        out.with_name(out.name + ".zip").write_bytes(_zip_stored(files))
+            if name not in files:
+                (out / name).unlink(missing_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot write {out}: {error.strerror}") from None
+        raise ConfigError(f"cannot write {error.filename or out}: {error.strerror}") from None
 
 
 def _to_npz(arrays: dict[str, np.ndarray]) -> bytes:

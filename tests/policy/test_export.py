@@ -216,6 +216,30 @@ def test_an_exported_policy_is_written_again_with_this_versions_runtime(tmp_path
     }
 
 
+def test_a_full_disk_leaves_the_export_before_and_names_the_file(tmp_path, monkeypatch):
+    out = tmp_path / "policy"
+    writer.copy(sources.bundled_policy(), out)
+    bytes_of = lambda: {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before, write = bytes_of(), Path.write_bytes
+
+    def fill_up(path, data):
+        write(path, data[: len(data) // 2])
+        if path.name.startswith("cref_policy.c"):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", fill_up)
+    with pytest.raises(ConfigError, match=f"cannot write {out}/cref_policy.c: No space left"):
+        writer.copy(sources.bundled_policy("robust"), out)
+    assert bytes_of() == before
+
+
+def test_a_policy_without_files_in_c_leaves_none_of_the_one_before(tmp_path, monkeypatch):
+    writer.copy(sources.bundled_policy(), tmp_path / "policy")
+    monkeypatch.setattr(writer.c_files, "VARIANTS", ())
+    writer.copy(sources.bundled_policy(), tmp_path / "policy")
+    assert not list((tmp_path / "policy").glob("cref_policy.*"))
+
+
 def test_the_files_in_c_have_digests_and_are_not_needed_by_the_runtime(tmp_path):
     writer.copy(sources.bundled_policy(), tmp_path / "policy")
     digests = reader.read_contents(tmp_path / "policy")[0]["files"]
