@@ -13,8 +13,7 @@ from cref_jax import config, deploy, network, ppo, robot
 from cref_jax.config import Config
 from cref_jax.env import observations
 from cref_jax.policy.trained import TrainedPolicy
-from cref_jax.system import disk
-from cref_jax.training import distillation
+from cref_jax.training import distillation, run_dir
 
 HOLD_STEPS = 5  # assumed: 0.1 s on the last target, then the robot is let down
 STALE = 0.1  # s, two camera frames
@@ -203,13 +202,13 @@ def _guards(driven: robot.Robot) -> dict[str, Any]:
 
 def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
     """Describe the origin of the policy; the last start of its run represents all of them."""
-    c, origin = policy.config, policy.run / "origin.jsonl"
+    c = policy.config
     stages = distillation.samples_by_stage(c, policy.iteration)
-    start = [{"command": []}, *disk.read_objects(origin)][-1]
+    start = [{}, *run_dir.read_starts(policy.run)][-1]
     bare = lambda word: (
         Path(word).name if Path(word).is_absolute() else word
     )  # without private folders
-    start["command"] = [bare(word) for word in start["command"]]
+    start["command"] = [bare(word) for word in start.get("command", [])]
     return {
         "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "run": policy.run.name,

@@ -146,7 +146,7 @@ def count_samples(run: Path, c: Config, iteration: int) -> int:
     A run that goes on may do so with another number of robots; a start that goes on from before an
     earlier one replaces what that one did.
     """
-    starts = [(s.get("iteration", 0), s.get("num_envs", c.run.num_envs)) for s in _read_starts(run)]
+    starts = [(s.get("iteration", 0), s.get("num_envs", c.run.num_envs)) for s in read_starts(run)]
     samples, end = 0, iteration
     for first, num_envs in reversed([(0, c.run.num_envs), *starts]):
         samples += max(end - first, 0) * num_envs * c.ppo.horizon
@@ -154,12 +154,19 @@ def count_samples(run: Path, c: Config, iteration: int) -> int:
     return samples
 
 
-def _read_starts(run: Path) -> list[dict[str, Any]]:
-    return disk.read_objects(run / "origin.jsonl")
+def read_starts(run: Path) -> list[dict[str, Any]]:
+    """Read the lines of `write_origin`; those of another form are left out."""
+    return [line for line in disk.read_objects(run / "origin.jsonl") if _is_start(line)]
+
+
+def _is_start(line: dict[str, Any]) -> bool:
+    command = line.get("command", [])
+    are_words = isinstance(command, list) and all(isinstance(word, str) for word in command)
+    return are_words and all(isinstance(line.get(x, 0), int) for x in ("iteration", "num_envs"))
 
 
 def _read_origin(run: Path, start: int) -> dict[str, Any]:
-    return next(iter(_read_starts(run)[start:]), {})
+    return next(iter(read_starts(run)[start:]), {})
 
 
 def first_option(run: Path, name: str) -> str | None:

@@ -87,6 +87,9 @@ def test_the_manifest_has_the_command_and_no_one_s_folders(tmp_path):
     manifest = build_manifest(policy("full")._replace(run=tmp_path), ROBOT)
     command = manifest["provenance"]["trained_by"]["command"]
     assert command == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
+    (tmp_path / "origin.jsonl").write_text('{"command": 5}\n')
+    manifest = build_manifest(policy("full")._replace(run=tmp_path), ROBOT)
+    assert manifest["provenance"]["trained_by"] == {"command": []}
 
 
 @pytest.mark.parametrize("name", robot.ROBOTS)

@@ -94,6 +94,19 @@ def test_a_cut_last_line_loses_that_start_alone(tmp_path):
     assert run_dir.count_samples(tmp_path, C, 50) == (30 * 100 + 20 * 10) * 24
 
 
+@pytest.mark.parametrize(
+    "line", ["5", '{"command": 5}', '{"command": [5]}', '{"num_envs": "a"}', '{"iteration": null}']
+)
+def test_a_line_of_another_form_is_no_start(tmp_path, line):
+    run_dir.write_origin(tmp_path, 0, engine="warp", num_envs=100)
+    with (tmp_path / "origin.jsonl").open("a") as file:
+        file.write(line + "\n")
+    assert run_dir.count_samples(tmp_path, C, 10) == 10 * 100 * 24
+    assert run_dir.last_engine(tmp_path) == "warp"
+    (tmp_path / "origin.jsonl").write_text(line + "\n")
+    assert run_dir.first_option(tmp_path, "experiment") is None
+
+
 def test_a_start_that_came_to_no_iteration_is_forgotten(tmp_path):
     run_dir.write_origin(tmp_path, 0, engine="mjx")
     run_dir.write_origin(tmp_path, 0, engine="warp")
