@@ -22,6 +22,7 @@ from __future__ import annotations
 import cref_jax.runtime.threads  # noqa: F401
 
 import argparse
+import os
 import sys
 
 from cref_jax.runtime.check import check, replay
@@ -54,7 +55,10 @@ __all__ = [
 
 
 def main() -> None:
-    """Run the command line; exit code 2 if something cannot be read, 1 if something is odd."""
+    """Run the command line; exit code 2 if something cannot be read, 1 if something is odd.
+
+    It is 141, as of a program that SIGPIPE ends, where nobody reads the output to its end.
+    """
     parser = argparse.ArgumentParser(description="An exported policy on this machine.")
     add, both = parser.add_mutually_exclusive_group(required=True).add_argument, ("FILE", "POLICY")
     add("--selftest", metavar="POLICY", help="compare with training; a directory or its .zip")
@@ -62,7 +66,12 @@ def main() -> None:
     add("--check", nargs=2, metavar=both, help="what is odd of a robot that stood still for 5 s")
     asked = parser.parse_args()
     try:
-        sys.exit(_run(asked))
+        code = _run(asked)
+        sys.stdout.flush()
+        sys.exit(code)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # flushed once more at exit
+        sys.exit(141)
     except PolicyFormatError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -1,5 +1,6 @@
 """A recording of a robot that stands: what is odd in it, and what a policy says to it again."""
 
+import os
 import subprocess
 import sys
 
@@ -177,5 +178,11 @@ def test_the_command_line_says_it_with_its_exit_code(tmp_path):
     assert ask("--check", recording, str(POLICY)).stdout == "nothing is odd\n"
     done = ask("--replay", recording, str(POLICY))
     assert done.returncode == 0 and Status.NO_DEPTH.name not in done.stdout
+    command = [sys.executable, "-m", "cref_jax.deploy", "--replay", recording, str(POLICY)]
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")  # nobody reads
     missing = ask("--check", "nothing.npz", str(POLICY))
     assert missing.returncode == 2 and missing.stderr.startswith("error: nothing.npz: no recording")
