@@ -1,5 +1,7 @@
 """One door to all commands: `cref train` is `python -m cref_jax.train`, and so on."""
 
+import cref_jax.system.startup  # noqa: F401
+
 import ast
 import difflib
 import importlib.util

@@ -14,6 +14,7 @@ import tyro
 
 from cref_jax.config.ranges import check_ranges, declared_ranges
 from cref_jax.errors import CheckpointError, ConfigError, TrainingError
+from cref_jax.system import interrupts
 
 R = TypeVar("R")
 READER_GONE = 141  # exit code of a program that SIGPIPE ends
@@ -91,9 +92,7 @@ def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
     except KeyboardInterrupt:
         if not is_program:
             raise
-        print("interrupted", file=sys.stderr)
-        sys.stdout.flush()
-        os._exit(130)  # at once: a running XLA program may still call into this interpreter
+        interrupts.end_interrupted()
 
 
 @contextlib.contextmanager

@@ -7,8 +7,16 @@ import sys
 import threading
 import time
 from types import FrameType
+from typing import NoReturn
 
 ONE_REQUEST = 1.0  # s; assumed: a terminal that closes sends SIGHUP twice within a millisecond
+
+
+def end_interrupted() -> NoReturn:
+    """Say that Ctrl-C has come, and end this process with exit code 130."""
+    print("interrupted", file=sys.stderr)
+    sys.stdout.flush()
+    os._exit(130)  # at once: a running XLA program may still call into this interpreter
 
 
 class StopRequest:

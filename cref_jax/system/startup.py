@@ -1,11 +1,24 @@
 """Environment variables that numpy and MuJoCo read at import; import this module before them.
 
-This is the only module whose import changes the process. It uses only the standard library.
+From here on Ctrl-C is one line, during the seconds that the other imports take as well. This is the
+only module whose import changes the process. It needs nothing but the standard library.
 """
 
 import os
 import sys
 from ctypes.util import find_library
+from types import TracebackType
+
+from cref_jax.system import interrupts
+
+
+def _show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if issubclass(kind, KeyboardInterrupt):
+        interrupts.end_interrupted()
+    sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _show
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 

@@ -39,3 +39,20 @@ def started(libraries, **changes):
 )
 def test_opengl_is_one_that_is_there_and_numpy_has_one_thread(libraries, changes, expected):
     assert started(libraries, **changes) == expected
+
+
+INTERRUPT = """
+import runpy, sys
+class Finder:
+    def find_spec(self, name, *_):
+        if name in ("jax", "tyro", "numpy"):
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Finder())
+runpy.run_module(sys.argv[1], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("module", ["cref_jax", "cref_jax.play", "cref_jax.train"])
+def test_ctrl_c_while_a_command_is_loaded_is_one_line(module):
+    done = subprocess.run([sys.executable, "-c", INTERRUPT, module], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
