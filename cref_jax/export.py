@@ -2,6 +2,7 @@
 
 import cref_jax.system.startup  # noqa: F401
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,9 +54,10 @@ def main(arguments: list[str] | None = None) -> None:
         size = sum(file.stat().st_size for file in options.out.iterdir()) / 1e6
         print(f"{options.out}: {size:.1f} MB; outputs match the trained network")
         print("\n".join(deploy.report(times)))
-        print(f"on the robot: python {options.out}/cref_runtime.py --selftest {options.out}")
+        program = shlex.join(["python", f"{options.out}/cref_runtime.py"])
+        print(f"on the robot: {program} --selftest {shlex.quote(str(options.out))}")
         if (options.out / "cref_policy.c").is_file():
-            print(f"in C: cc -std=c99 -O2 -c {options.out}/cref_policy.c")
+            print(f"in C: cc -std=c99 -O2 -c {shlex.quote(f'{options.out}/cref_policy.c')}")
 
 
 def _export(options: Options) -> None:
@@ -81,7 +83,8 @@ def _write_learner(run: Path, out: Path) -> None:
     world = build_world(run_dir.read_config(run), "mujoco")
     print(sources.summarize(run), flush=True)
     learner_file.write(trained.load_policy(run, world), out)
-    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; python -m cref_jax.train --init {out}")
+    how = shlex.join(["python", "-m", "cref_jax.train", "--init", str(out)])
+    print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; {how}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 
 from cref_jax import cli
 from cref_jax.benchmarks import profiled
-from cref_jax.config import Config, limits, presets
+from cref_jax.config import Config, folders, limits, presets
 from cref_jax.env.world import World, build_physics, build_world
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import walking
@@ -344,7 +344,7 @@ def _summary(run: Path, c: Config, state: iteration.RunState, options: Options) 
         one = jax.device_put(learned, jax.local_devices()[0])
         result = walking.walk(c, physics, one)
         print(f"on flat ground: {result.line()}")
-    print(f'saved in {run}; next: make play ARGS="--run {run}"')
+    print(f"saved in {run}; next: {folders.command_line('play', '--run', run)}")
 
 
 def _with_short_options(c: Config, options: Options) -> Config:

@@ -113,9 +113,9 @@ def test_what_is_missing_is_said_with_the_command_that_makes_it(run):
     (run / "log.jsonl").unlink()
     (run / "origin.jsonl").unlink()
     text = shown(run).text
-    assert f"make eval ARGS='--run {run} --suite table'" in text
-    assert f"make play ARGS='--run {run}'" in text
-    assert f"make train ARGS='--run-dir {run} --resume'" in text
+    assert f'make eval ARGS="--run {run} --suite table"' in text
+    assert f'make play ARGS="--run {run}"' in text
+    assert f'make train ARGS="--run-dir {run} --resume"' in text
     assert "origin.jsonl is missing or empty" in text
 
 

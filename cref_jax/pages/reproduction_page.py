@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from cref_jax.config import folders
 from cref_jax.pages import evaluation_charts, learning_charts, markup
 from cref_jax.pages.evaluation_charts import SuccessRate
 from cref_jax.pages.learning_charts import LevelCurve
@@ -236,7 +237,7 @@ def _method_body(record: Record) -> Html:
         paragraph(record["gate_rule"]),
         note(
             "The paper's twenty scenes in MuJoCo are not part of it: ",
-            markup.code('make eval ARGS="--suite ood --run ROW"'),
+            markup.code(folders.command_line("eval", "--suite", "ood", "--run", "ROW")),
             ".",
         ),
         markup.definition_list(values),

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cref_jax.config import Config
+from cref_jax.config import Config, folders
 from cref_jax.errors import ConfigError
 from cref_jax.pages import evaluation_page, learning_charts, markup, training_log
 from cref_jax.pages.markup import MISSING, Column, Html, Section, code, join, note, paragraph
@@ -238,7 +238,7 @@ def _evaluation_sections(run: RunRecord) -> Iterator[Section]:
     if older:
         yield Section("Older evaluations", paragraph(", ".join(older)))
     if not shown:
-        command = _make_command("eval", run.folder, "--suite table")
+        command = _make_command("eval", run.folder, "--suite", "table")
         missing = note("No evaluation yet. Run ", command)
         yield Section("Evaluation", missing)
 
@@ -261,11 +261,9 @@ def _media_body(folder: Path) -> Html:
 
 
 def _make_command(target: str, folder: Path, *more: str) -> Html:
-    """Format the `make` command that creates missing data of the run."""
+    """Format the command that creates missing data of the run."""
     option = "--run-dir" if target == "train" else "--run"
-    options = " ".join((option, shlex.quote(str(folder)), *more))
-    quoted = shlex.quote(options) if chr(39) in options else repr(options)
-    return code(f"make {target} ARGS={quoted}")
+    return code(folders.command_line(target, option, folder, *more))
 
 
 def _format_command(words: Any) -> str:

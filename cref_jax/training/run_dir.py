@@ -25,7 +25,7 @@ from typing import Any
 
 import jax
 
-from cref_jax.config import Config, presets
+from cref_jax.config import Config, folders, presets
 from cref_jax.errors import ConfigError
 from cref_jax.robot.registry import name_robot
 from cref_jax.system import disk
@@ -218,10 +218,9 @@ def newest(root: Path = ROOT, robot: str | None = None) -> Path:
     if robot is not None:
         runs = [run for run in runs if _robot_of(run) == robot]
     if not runs:
-        whose, how = (f" of '{robot}'", f' ARGS="--robot {robot}"') if robot else ("", "")
-        raise ConfigError(
-            f"no trained run{whose} in {root}/; train one with: make train TERRAIN=flat{how}"
-        )
+        whose, more = (f" of '{robot}'", ["--robot", robot]) if robot else ("", [])
+        how = folders.command_line("train", "--terrain", "flat", *more)
+        raise ConfigError(f"no trained run{whose} in {root}/; train one with: {how}")
     return max(runs, key=lambda run: (run / "checkpoints").stat().st_mtime)
 
 

@@ -164,7 +164,7 @@ def test_a_run_that_cannot_be_read_hides_no_other_run(tmp_path, monkeypatch, cap
 def test_without_a_run_of_the_robot_its_training_is_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert sources.resolve_policy(None, None, "x2_ultra") == sources.bundled_policy()
-    with pytest.raises(ConfigError, match=r"no trained run of 'g1' .* ARGS=\"--robot g1\""):
+    with pytest.raises(ConfigError, match=r"no trained run of 'g1' .* flat --robot g1\""):
         sources.resolve_policy(None, None, "g1")
 
 
