@@ -65,8 +65,14 @@ def read_kinds(name: str) -> dict[str, KindNumbers]:
     if "mix" not in table:
         return _parse_kinds(table, where)
     numbers: dict[str, KindNumbers] = {}
+    source: dict[str, str] = {}  # the part that defines each kind
     for part in _parse_mix(table, where).mix:
-        numbers |= _parse_kinds(*_load_table(part))
+        for kind, found in _parse_kinds(*_load_table(part)).items():
+            if kind in numbers:
+                raise ConfigError(
+                    f"{where}: mix: '{source[kind]}' and '{part}' both define the kind '{kind}'"
+                )
+            numbers[kind], source[kind] = found, part
     if not numbers:
         raise ConfigError(f"{where}: mix must name at least one terrain")
     return numbers

@@ -364,6 +364,10 @@ def test_a_mix_names_terrains_that_define_kinds(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('mix = ["gap", "mixed"]')
     refused("mixed.toml is a mix itself", lanes.build, config.Terrain(name=str(path)))
+    (tmp_path / "wide.toml").write_text(GAP)
+    path.write_text(f'mix = ["gap", "{tmp_path}/wide.toml"]')
+    said = f"mine.toml: mix: 'gap' and '{tmp_path}/wide.toml' both define the kind 'gap'"
+    refused(said, lanes.build, config.Terrain(name=str(path)))
     path.write_text("mix = []")
     refused("mix must name at least one", lanes.build, config.Terrain(name=str(path)))
 
