@@ -1,7 +1,7 @@
 """Every number of the program, and how a run changes them."""
 
 from cref_jax.config.learning import HPL, PPO, Distillation, Network, Run, Variant
-from cref_jax.config.overrides import describe_unknown, load_toml, override
+from cref_jax.config.overrides import check_finite, describe_unknown, load_toml, override
 from cref_jax.config.settings import Config
 from cref_jax.config.simulation import (
     NARROW_VIEW,
@@ -37,6 +37,7 @@ __all__ = [
     "Scan",
     "Terrain",
     "Variant",
+    "check_finite",
     "describe_unknown",
     "load_toml",
     "override",

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import math
 import re
 import tomllib
 import types
@@ -66,6 +67,19 @@ def load_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"no file {path}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def check_finite(value: Any, where: str) -> None:
+    """Refuse NaN and infinity anywhere in a table.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    if isinstance(value, dict | list):
+        for inner in value.values() if isinstance(value, dict) else value:
+            check_finite(inner, where)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where}: every number must be finite, not {value}")
 
 
 def _check_value(value: Any, hint: Any, path: str) -> Any:

@@ -108,7 +108,9 @@ def _load_table(name: str) -> tuple[dict[str, Any], str]:
         if name not in known:
             raise ConfigError(config.describe_unknown("terrain", name, known))
         path = folders.data_folder("terrains") / f"{name}.toml"
-    return config.load_toml(path), path.name
+    table = config.load_toml(path)
+    config.check_finite(table, path.name)
+    return table, path.name
 
 
 def read_kind(c: config.Terrain, kind: str) -> KindNumbers:

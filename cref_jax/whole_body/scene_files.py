@@ -170,7 +170,7 @@ def load(path: Path) -> Scene:
     """
     where = path.name
     table = config.load_toml(path)
-    _check_finite(table, where)
+    config.check_finite(table, where)
     file = _read_record(_File, table, where)
     if not (file.end > 0.0 and file.width > 0.0):
         raise ConfigError(f"{where}: end and width must be above zero")
@@ -283,12 +283,3 @@ def _read_record(cls: type[R], table: dict[str, Any], where: str) -> R:
     if missing and table.keys() <= {f.name for f in fields}:
         raise ConfigError(f"{where}: '{missing[0]}' is missing")
     return config.override(object.__new__(cls), table, where=f"{where}: ")
-
-
-def _check_finite(value: Any, where: str) -> None:
-    """Refuse NaN and infinity anywhere in a table."""
-    if isinstance(value, dict | list):
-        for inner in value.values() if isinstance(value, dict) else value:
-            _check_finite(inner, where)
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where}: every number must be finite, not {value}")

@@ -342,6 +342,8 @@ GAP = 'kinds = ["gap"]\ntrain = [0.1, 0.2]\n[shape]\ncount = 1\ndepth = 1.0\nlan
         ('["gap"]', "[]", "mine.toml: kinds must name at least one"),
         ("count = 1", 'count = "1"', "must be int, not '1'"),
         ("depth = 1.0", "depth = 0.0", "shape: depth must be above zero and rising, not 0.0"),
+        ("depth = 1.0", "depth = nan", "mine.toml: every number must be finite, not nan"),
+        ("0.1, 0.2", "0.0, inf", "mine.toml: every number must be finite, not inf"),
         ("[2.0, 2.0]", "[2.5, 1.5]", "landing must be above zero and rising, not [2.5, 1.5]"),
         ("[shape]", "[practice]\nlanding = [2.0, 1.0]\n[shape]", "practice: landing must be above"),
         ("[shape]", "[practice]\nland = 1\n[shape]", "practice: land'; did you mean 'landing'?"),
