@@ -91,6 +91,15 @@ def test_a_resumed_run_keeps_its_settings(first, setting, value, says):
         train.parse(["--resume", "--run-dir", str(first), setting, value])
 
 
+def test_a_run_that_has_done_more_than_is_asked_for_is_left_as_it_is(first):
+    before = (first / "config.json").read_bytes()
+    said = f"{first} has done 2 iterations already; --iterations must be more, not 1"
+    with pytest.raises(ConfigError, match=said):
+        train.parse(["--resume", "--run-dir", str(first), "--iterations", "1"])
+    train.parse(["--resume", "--run-dir", str(first), "--iterations", "2"])
+    assert (first / "config.json").read_bytes() == before
+
+
 def test_a_resumed_run_says_what_changes_and_what_is_not_taken(first, tmp_path):
     arguments = ["--resume", "--run-dir", str(first), "--iterations", "9", "--run.keep", "1"]
     _, c = train.parse([*arguments, "--run.checkpoint-minutes", "2", "--num-envs", "4"])

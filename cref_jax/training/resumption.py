@@ -90,11 +90,17 @@ def check_origin(
 
 
 def check_settings(run: Path, own: Config, asked: Config) -> None:
-    """Refuse settings with which the run would be another one.
+    """Refuse settings with which the run would be another one, or had ended before it got here.
 
     Raises:
         ConfigError: names each, with the run's value and the one asked for.
     """
+    done = run_dir.checkpoints(run).latest() or 0
+    if asked.run.iterations < done:
+        raise ConfigError(
+            f"{run} has done {done} iterations already; --iterations must be more, not "
+            f"{asked.run.iterations}"
+        )
     may_change = [x for x in MAY_CHANGE if x != "run.num_envs" or own.network.variant != "hpl"]
     fixed = [x for x in _find_differences(own, asked) if x[0] not in may_change]
     if fixed:
