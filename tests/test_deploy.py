@@ -115,6 +115,7 @@ def test_level_ground_has_no_holes(robot, nothing):
         (np.zeros((64, 48), np.float32), 0.0, Status.BAD_DEPTH),
         (np.ones((48, 64), np.int64), 0.0, Status.BAD_DEPTH),
         (None, 0.0, Status.BAD_DEPTH),
+        (np.ma.masked_less(frame(), 2.0), 0.0, Status.BAD_DEPTH),
         ("depth", 0.0, Status.BAD_DEPTH),
         (frame(), float("nan"), Status.BAD_DEPTH),
         (frame(), None, Status.BAD_DEPTH),
@@ -156,6 +157,7 @@ BAD = [
     {"angular_velocity": np.array([1e39, 0.0, 0.0])},
     {"command": np.zeros(3, complex)},
     {"command": np.zeros((1, 3))},
+    {"q": np.ma.masked_array(ROBOT.nominal_pose, [True] + [False] * (J - 1))},
     {"now": float("nan")},
     {"now": None},
 ]
@@ -373,6 +375,7 @@ def test_a_frame_of_another_view_shows_what_the_renderer_does(robot):
         (np.ones((4, 4)), (58.0,)),
         (np.ones((4, 4)), (0.0, 87.0)),
         (np.ones((0, 4)), (58.0, 87.0)),
+        (np.ma.masked_less(np.ones((48, 64)), 2.0), (58.0, 87.0)),
     ],
 )
 def test_what_is_no_frame_or_no_view_is_not_resampled(robot, frame, view):

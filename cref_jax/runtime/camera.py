@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from cref_jax.runtime.cross_checks import FADE, FROZEN_MOTION, Agreement
+from cref_jax.runtime.recorder import to_array
 from cref_jax.runtime.status import UNUSED_FRAME, Status
 from cref_jax.runtime.tables import Table
 
@@ -98,9 +99,9 @@ class Camera:
     def _read(self, depth: Any, stamp: Any) -> tuple[str, np.ndarray]:
         """Say why a frame cannot be read, nothing if it can, and convert it to an array."""
         try:
-            frame, stamp = np.asarray(depth), float(stamp)
+            frame, stamp = to_array(depth), float(stamp)
         except Exception:  # an object's own conversion may raise anything
-            return "the frame is no array, or its stamp no number", np.zeros(0)
+            return "the frame is no plain array, or its stamp no number", np.zeros(0)
         if frame.shape != self.shape:
             rows, columns = self.shape
             return f"a frame must be {rows} x {columns}, rows x columns, not {frame.shape}", frame

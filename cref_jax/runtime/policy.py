@@ -19,7 +19,7 @@ from cref_jax.runtime.joints import read_joints
 from cref_jax.runtime.legs import Legs
 from cref_jax.runtime.network import VARIANTS
 from cref_jax.runtime.nudge import Nudge
-from cref_jax.runtime.recorder import Recorder, to_time
+from cref_jax.runtime.recorder import Recorder, to_array, to_time
 from cref_jax.runtime.senses import Senses
 from cref_jax.runtime.status import (
     FAULTS,
@@ -178,7 +178,7 @@ class Policy:
         Raises:
             ValueError: the frame is no image, the view no view, or the policy is blind.
         """
-        image = np.asarray(frame)
+        image = to_array(frame)
         if self._camera is None:
             raise ValueError("this policy takes no frames")
         if image.ndim != 2 or image.size == 0 or image.dtype.kind not in "fiu":

@@ -92,10 +92,17 @@ def to_time(value: Any) -> float:
         return math.nan
 
 
+def to_array(value: Any) -> np.ndarray:
+    """Convert to an array without a mask, under which any number may be hidden."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError("an array must be one without a mask")
+    return np.asarray(value)
+
+
 def _copy_numbers(value: Any) -> np.ndarray:
     """Copy an input, which may be anything, to an array; an empty one if it is no numbers."""
     try:
-        array = np.array(value)
+        array = np.array(to_array(value))
     except Exception:  # an object's own conversion may raise anything
         return np.zeros(0)
     return array if array.dtype.kind in "fiu" and array.size <= 1 << 22 else np.zeros(0)

@@ -11,6 +11,7 @@ import numpy as np
 from cref_jax.runtime.cross_checks import CrossChecks
 from cref_jax.runtime.joints import Joints
 from cref_jax.runtime.legs import Legs
+from cref_jax.runtime.recorder import to_array
 from cref_jax.runtime.status import FAULTS, Status
 
 GRAVITY_LENGTH = (0.8, 1.25)  # of a unit vector; rejects m/s^2
@@ -126,7 +127,7 @@ class Senses:
 def to_vector(value: Any, size: int) -> np.ndarray | None:
     """Convert to f32[size]; None unless the value is `size` finite numbers."""
     try:
-        array = np.asarray(value)
+        array = to_array(value)
     except Exception:  # an object's own conversion may raise anything
         return None
     if array.dtype.kind not in "fiu" or array.shape != (size,):
