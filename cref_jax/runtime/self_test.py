@@ -8,7 +8,13 @@ import time
 
 import numpy as np
 
-from cref_jax.runtime.files import parse_arrays, read_file, read_manifest, read_verified
+from cref_jax.runtime.files import (
+    one_error,
+    parse_arrays,
+    read_file,
+    read_manifest,
+    read_verified,
+)
 from cref_jax.runtime.policy import TERMS, Policy, load
 from cref_jax.runtime.status import FAULTS, Status
 from cref_jax.runtime.tables import PolicyFormatError
@@ -22,15 +28,17 @@ def self_test(path: str | os.PathLike[str], rounds: int = 20) -> dict[str, np.nd
     Raises:
         PolicyFormatError: it cannot be loaded, or its outputs differ from the training network's.
     """
-    policy, manifest = load(path, careful=False), read_manifest(read_file(path, "manifest.json"))
-    if "cref_runtime.py" in manifest["files"]:  # a policy within the package uses the package's own
-        read_verified(path, "cref_runtime.py", manifest)
-    vectors = parse_arrays(read_verified(path, "testvectors.npz", manifest))
-    errors: dict[str, float] = {}
-    steps = [_replay(policy, vectors, errors) for _ in range(rounds)]
-    name = max(errors, key=lambda n: errors[n])
-    if not errors[name] <= TOLERANCE:
-        raise PolicyFormatError(f"'{name}' differs from training's by {errors[name]:.1e}")
+    with one_error(path):
+        policy = load(path, careful=False)
+        manifest = read_manifest(read_file(path, "manifest.json"))
+        if "cref_runtime.py" in manifest["files"]:  # one within the package uses the package's own
+            read_verified(path, "cref_runtime.py", manifest)
+        vectors = parse_arrays(read_verified(path, "testvectors.npz", manifest))
+        errors: dict[str, float] = {}
+        steps = [_replay(policy, vectors, errors) for _ in range(rounds)]
+        name = max(errors, key=lambda n: errors[n])
+        if not errors[name] <= TOLERANCE:
+            raise PolicyFormatError(f"'{name}' differs from training's by {errors[name]:.1e}")
     seconds, frames = np.concatenate(steps).T
     times = {"a frame and a step": seconds[frames > 0], "a step": seconds[frames == 0]}
     return {name: durations for name, durations in times.items() if len(durations)}

@@ -2,6 +2,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -203,6 +204,14 @@ def test_the_bundled_policy_is_whole_and_small_enough():
     deploy.self_test(sources.bundled_policy(), rounds=1)
     files = list(sources.bundled_policy().iterdir())
     assert sum(file.stat().st_size for file in files) < 10e6
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"PK")])
+def test_test_vectors_that_cannot_be_read_are_those_of_a_folder(tmp_path, damage):
+    shutil.copytree(sources.bundled_policy(), tmp_path / "policy")
+    damage(tmp_path / "policy" / "testvectors.npz")
+    with pytest.raises(deploy.PolicyFormatError, match=f"^{tmp_path}/policy: .*testvectors.npz"):
+        deploy.self_test(tmp_path / "policy", rounds=1)
 
 
 def test_an_exported_policy_is_written_again_with_this_versions_runtime(tmp_path):
