@@ -211,7 +211,7 @@ def show(
     products, memory = rates.products / 1e9, rates.memory / 1e9
     console = Console()
     console.print(f"matrix products {products:,.0f} GFLOP/s, memory {memory:,.1f} GB/s per device")
-    console.print(table)
+    cli.print_table(table)
     for name, ratio in ratios(rows).items():
         console.print(f"{name}: {ratio:,.3g}")
     if not speeds:
@@ -221,7 +221,7 @@ def show(
         table.add_column(column, justify="left" if column == "renderer" else "right")
     for s in speeds:
         table.add_row(s.renderer, f"{s.frames_per_second:,.0f}", s.threads, f"{s.agreement:.1%}")
-    console.print(table)
+    cli.print_table(table)
 
 
 def ratios(rows: list[StageTime]) -> dict[str, float]:

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
 from cref_jax.config.ranges import check_ranges, declared_ranges
 from cref_jax.errors import CheckpointError, ConfigError, TrainingError
@@ -18,6 +20,7 @@ from cref_jax.system import interrupts
 
 R = TypeVar("R")
 READER_GONE = 141  # exit code of a program that SIGPIPE ends
+TABLE_WIDTH = 1000  # characters; assumed: more than any table has
 
 
 @dataclass(frozen=True)
@@ -147,3 +150,8 @@ def prepare_folder(folder: Path) -> Path:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ConfigError(f"cannot write in the folder {folder}")
     return folder
+
+
+def print_table(table: Table) -> None:
+    """Print a table in its own width: a narrower terminal breaks its lines, and cuts no number."""
+    Console(width=TABLE_WIDTH).print(table)

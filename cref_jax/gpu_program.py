@@ -234,8 +234,8 @@ def show(c: Config, card: Card, compiled: jax.stages.Compiled, stages: dict[str,
     for name, s in [*stages.items(), ("iteration", total)]:
         work = f"{s.launches:,.0f}", f"{s.bytes / 1e9:,.1f}", f"{s.flops / 1e12:,.2f}"
         table.add_row(name, *work, f"{1e3 * s.seconds:,.1f}")
+    cli.print_table(table)
     console = Console()
-    console.print(table)
     if memory := compiled.memory_analysis():
         gib = memory.argument_size_in_bytes / 2**30, memory.temp_size_in_bytes / 2**30
         console.print(f"memory: {gib[0]:.2f} GiB of state, {gib[1]:.2f} GiB temporary")

@@ -5,7 +5,6 @@ import cref_jax.system.startup  # noqa: F401
 import typing
 from dataclasses import dataclass
 
-from rich.console import Console
 from rich.table import Table
 
 from cref_jax import cli, config
@@ -24,7 +23,7 @@ def main(arguments: list[str] | None = None) -> None:
         cli.parse(Options, arguments, "params")
         names = typing.get_args(config.Variant)
         configs = {name: presets.apply_file(Config(), name) for name in names}
-        Console().print(build_table(count_parameters(configs)))
+        cli.print_table(build_table(count_parameters(configs)))
 
 
 def build_table(counts: dict[str, dict[str, int]]) -> Table:

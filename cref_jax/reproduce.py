@@ -177,8 +177,8 @@ def print_plan(folder: Path, plan: Plan) -> None:
         f"{len(plan.rows)} rows", "", f"{total / 1e6:,.1f} M", hours(seconds),
         hours(total / GPU_SPEED), "",
     )  # fmt: skip
+    cli.print_table(table)
     console = Console()
-    console.print(table)
     for line in _plan_notes(here):
         console.print(line, highlight=False, soft_wrap=True)
 

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.progress import track
 
 from cref_jax import cli, deploy
@@ -132,7 +131,7 @@ def _run_table(
             theirs.append(run_in_training(policy, physics, on))
         cells.append(sim2sim_table.CellComparison(name, tuple(theirs), tuple(ours)))
         print(cells[-1].line(), flush=True)
-    Console().print(sim2sim_table.to_table(cells))
+    cli.print_table(sim2sim_table.to_table(cells))
     asdict = lambda crossings: [c._asdict() for c in crossings]
     return {c.name: {"stand_in": asdict(c.stand_in), "training": asdict(c.training)} for c in cells}
 

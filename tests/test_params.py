@@ -1,5 +1,6 @@
 """The sizes of the networks."""
 
+import re
 import typing
 
 from cref_jax import config, params
@@ -35,3 +36,11 @@ def test_the_count_of_each_variant_is_that_of_its_layers():
     assert teacher["gru"] == (45 + 32) * gates + gates + 256 * gates + 256
     table = params.build_table(counts)
     assert [str(column.header) for column in table.columns] == ["part", *counts]
+
+
+def test_no_number_is_cut_on_a_narrow_terminal(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "20")
+    params.main([])
+    said = capsys.readouterr().out
+    assert "no_cross_attention" in said and "…" not in said
+    assert re.search(r"policy.* 1,\d{3},\d{3} ", said)

@@ -93,7 +93,8 @@ def test_settings_whose_quotes_are_open_are_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == 'error: --settings "--ppo.epochs 3: No closing quotation\n'
 
 
-def test_the_plan_is_printed_and_nothing_is_written(tmp_path, capsys):
+def test_the_plan_is_printed_and_nothing_is_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")  # and is whole on a narrow terminal
     out = tmp_path / "out"
     words = ["--plan", "--variants", "full", "hpl", "--seeds", "0", "--samples", "20e6"]
     reproduce.main([*words, "--device", "cpu", "--out", str(out)])
