@@ -1,6 +1,6 @@
 """Watch a robot walk: `python -m cref_jax.play --run runs/NAME`, or drive it with `--live`.
 
-Without a run, `--agent stand --terrain stairs` shows the robot and the lane.
+Without a run, `--agent stand` shows the robot, and `--policy mixed --terrain stairs` a lane.
 """
 
 import cref_jax.system.startup  # noqa: F401
