@@ -1,7 +1,8 @@
 """Environment variables that numpy and MuJoCo read at import; import this module before them.
 
-From here on Ctrl-C is one line, during the seconds that the other imports take as well. This is the
-only module whose import changes the process. It needs nothing but the standard library.
+From here on Ctrl-C is one line in our own commands, during the seconds that the other imports take
+as well. This is the only module whose import changes the process. It needs nothing but the standard
+library.
 """
 
 import os
@@ -18,7 +19,9 @@ def _show(kind: type[BaseException], error: BaseException, trace: TracebackType 
     sys.__excepthook__(kind, error, trace)
 
 
-sys.excepthook = _show
+_spec = getattr(sys.modules["__main__"], "__spec__", None)  # of `python -m`
+if os.path.basename(sys.argv[0]) == "cref" or (_spec and _spec.name.startswith("cref_jax.")):
+    sys.excepthook = _show
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 

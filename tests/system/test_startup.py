@@ -48,7 +48,7 @@ class Finder:
         if name in ("jax", "tyro", "numpy"):
             raise KeyboardInterrupt
 sys.meta_path.insert(0, Finder())
-runpy.run_module(sys.argv[1], run_name="__main__")
+runpy.run_module(sys.argv[1], run_name="__main__", alter_sys=True)
 """
 
 
@@ -56,3 +56,10 @@ runpy.run_module(sys.argv[1], run_name="__main__")
 def test_ctrl_c_while_a_command_is_loaded_is_one_line(module):
     done = subprocess.run([sys.executable, "-c", INTERRUPT, module], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+def test_a_program_that_imports_a_command_keeps_its_own_traceback():
+    program = INTERRUPT.replace("runpy.run_module(", "__import__(sys.argv[1]) #")
+    command = [sys.executable, "-c", program, "cref_jax.params"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode != 130 and "Traceback" in done.stderr
