@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cref_jax import cli
 from cref_jax.errors import ConfigError
+from cref_jax.system import interrupts
 
 COMMANDS = (
     "train",
@@ -43,7 +44,11 @@ def main(arguments: list[str] | None = None) -> None:
             hint = f"did you mean {near[0]}?" if near else "cref --help lists them"
             raise ConfigError(f"unknown command '{name}'; {hint}")
         sys.argv[1:] = rest
-        runpy.run_module(f"cref_jax.{name}", run_name="__main__", alter_sys=True)
+        interrupts.end_while_loading()
+        try:
+            runpy.run_module(f"cref_jax.{name}", run_name="__main__", alter_sys=True)
+        finally:
+            interrupts.raise_from_here()
 
 
 def _describe_commands() -> str:

@@ -77,6 +77,7 @@ def one_line_errors(arguments: Sequence[str] | None = None) -> Iterator[None]:
     a script that has called the command with `arguments` goes on after Ctrl-C.
     """
     is_program = arguments is None
+    interrupts.raise_from_here()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # a terminal of few characters loses no result
     try:

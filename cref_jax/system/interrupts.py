@@ -19,6 +19,23 @@ def end_interrupted() -> NoReturn:
     os._exit(130)  # at once: a running XLA program may still call into this interpreter
 
 
+def _end(number: int, frame: FrameType | None) -> None:
+    end_interrupted()
+
+
+def end_while_loading() -> None:
+    """End at Ctrl-C until `raise_from_here`: what is imported may swallow an exception."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _end)
+
+
+def raise_from_here() -> None:
+    """Let Ctrl-C be a KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is _end:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 class StopRequest:
     """Records the first Ctrl-C, SIGTERM or SIGHUP so that work can be saved.
 

@@ -1,27 +1,18 @@
 """Environment variables that numpy and MuJoCo read at import; import this module before them.
 
-From here on Ctrl-C is one line in our own commands, during the seconds that the other imports take
-as well. This is the only module whose import changes the process. It needs nothing but the standard
-library.
+From here on Ctrl-C ends a command, also during the seconds that the other imports take. This is the
+only module whose import changes the process. It needs nothing but the standard library.
 """
 
 import os
 import sys
 from ctypes.util import find_library
-from types import TracebackType
 
 from cref_jax.system import interrupts
 
-
-def _show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    if issubclass(kind, KeyboardInterrupt):
-        interrupts.end_interrupted()
-    sys.__excepthook__(kind, error, trace)
-
-
-_spec = getattr(sys.modules["__main__"], "__spec__", None)  # of `python -m`
-if os.path.basename(sys.argv[0]) == "cref" or (_spec and _spec.name.startswith("cref_jax.")):
-    sys.excepthook = _show
+_spec = getattr(sys.modules["__main__"], "__spec__", None)
+if sys.argv[0].endswith("cref") or (_spec and _spec.name.startswith("cref_jax.")):
+    interrupts.end_while_loading()  # a command, not a program that imports one
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
