@@ -42,8 +42,8 @@ def main() -> None:
         share = [100.0 * (row["share"] or 0.0) for row in rows]
         shares.barh(y, share, height)
     times.set_yticks(range(len(stages)), stages)
-    times.set_xlabel("us per control step of a robot, on all cores")
-    times.legend(loc="center right")
+    times.set_xlabel("µs per control step of a robot, on all cores")
+    times.legend(loc="center right", reverse=True)  # as the bars are drawn, from below
     shares.set_xlabel("% of the machine's bound, where known")
     figure.suptitle(_title(record))
     figure.savefig(options.out, dpi=100)

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 
 from cref_jax import config, terrain
 from cref_jax.env import footholds
-from cref_jax.terrain import lanes
+from cref_jax.terrain import generators, lanes
 
 SIZES = {"stairs_up": 0.15, "stairs_down": 0.15, "gap": 0.5, "slope": 0.3}  # m; m/m for the slope
 BEFORE = 0.2  # m from the sole's centre to the obstacle
@@ -62,13 +62,19 @@ def draw(axis: Axes, kind: str, size: float, command: float) -> None:
     axis.scatter(x[x >= gate], z[x >= gate], s=5, color="tab:blue", label="points", zorder=2)
     axis.scatter(x[x < gate], z[x < gate], s=5, color="0.8", label="points before the gate")
     axis.scatter(
-        *mean[:, rejected], marker="x", color="red", s=20, lw=0.7, label="rejected", zorder=3
+        *mean[:, rejected],
+        marker="x",
+        color="red",
+        s=20,
+        lw=0.7,
+        label="window, rejected",
+        zorder=3,
     )
-    axis.scatter(*mean[:, ok], color="green", s=40, label="accepted", zorder=4)
+    axis.scatter(*mean[:, ok], color="green", s=40, label="window, accepted", zorder=4)
     axis.axvline(gate, color="0.7", lw=0.8, ls="--")
     near = height[(lane_x > start - 0.2) & (lane_x < start + 1.3)]
     axis.set(xlim=(-0.2, 1.3), ylim=(near.min() - 0.1, near.max() + 0.1))
-    axis.set(xlabel="x, m", ylabel="z, m", title=f"{kind} {size:g}")
+    axis.set(xlabel="x, m", ylabel="z, m", title=f"{kind} {generators.format_size(kind, size)}")
     axis.set_aspect("equal")
     axis.grid(alpha=0.3)
 
