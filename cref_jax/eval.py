@@ -164,10 +164,10 @@ def _trials_per_cell(options: Options) -> int:
 
 def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Evaluate in all cells of Table II."""
-    console, count = Console(), _trials_per_cell(options)
-    console.print(f"{tables.interval_note(count * len(subjects))}\n{tables.RULE}", highlight=False)
+    count = _trials_per_cell(options)
+    print(f"{tables.interval_note(count * len(subjects))}\n{tables.RULE}", flush=True)
     judged, witness = [], Witness()  # of the first policy
-    with _progress(console, 12 * count * len(subjects)) as ended:
+    with _progress(Console(), 12 * count * len(subjects)) as ended:
         for subject in subjects:
             train = subject.policy.train
             w = tables.cell_world(subject.policy.config, subject.world.physics)
@@ -175,24 +175,24 @@ def _table(subjects: list[Subject], options: Options) -> dict[str, Any]:
             judged.append(tables.run_cells(w, train, count, options.seed, ended, see))
     rows = tables.cell_rows(judged)
     whole = tables.overall(rows)
-    console.print(tables.to_table(rows, whole))
-    console.print("* beyond chance: 0 is not in the 95 % interval of the difference")
-    console.print(tables.failure_lines(rows), highlight=False)
+    cli.print_table(tables.to_table(rows, whole))
+    print("* beyond chance: 0 is not in the 95 % interval of the difference")
+    print(tables.failure_lines(rows))
     seen = _pictures(witness, options)
     return {"rule": tables.RULE, "cells": rows, "overall": whole, **seen}
 
 
 def _robust(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Evaluate with everything randomised, and with each part alone."""
-    console, count, policy = Console(), _trials_per_cell(options), subjects[0].policy
+    count, policy = _trials_per_cell(options), subjects[0].policy
     w = robustness_suite.row_world(policy.config, subjects[0].world.physics)
-    with _progress(console, len(robustness_suite.list_rows()) * count) as ended:
+    with _progress(Console(), len(robustness_suite.list_rows()) * count) as ended:
         witness = Witness()
         found = robustness_suite.run_rows(
             w, policy.train, count, options.seed, ended, witness=witness
         )
-    console.print(robustness_suite.to_table(found))
-    console.print(robustness_suite.parts_table(found))
+    cli.print_table(robustness_suite.to_table(found))
+    cli.print_table(robustness_suite.parts_table(found))
     whole = [row for row in found if row["part"] == robustness_suite.EVERYTHING]
     parts = [row for row in found if row["part"] != robustness_suite.EVERYTHING]
     overall = robustness_suite.overall(found)
@@ -204,7 +204,8 @@ def _ood(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Evaluate in the scenes, through the numpy runtime."""
     with _export_subject(subjects[0]) as path:
         verdict = scene_suite.run_scenes(path, options.num_envs or 10, options.stress, options.seed)
-    scene_results.print_tables(verdict, Console())
+    for table in scene_results.to_tables(verdict):
+        cli.print_table(table)
     return verdict.as_dict()
 
 
@@ -264,14 +265,14 @@ def _pictures(witness: Witness, options: Options) -> dict[str, Any]:
 
 def _commands(subjects: list[Subject], options: Options) -> dict[str, Any]:
     """Evaluate how commands are followed on level ground."""
-    policy, console = subjects[0].policy, Console()
-    with console.status("13 commands, 10 s each"):
+    policy = subjects[0].policy
+    with Console().status("13 commands, 10 s each"):
         physics = subjects[0].world.physics
         found = command_suite.run_commands(
             policy.config, physics, policy.train, _trials_per_cell(options), options.seed
         )
-    console.print(command_suite.to_table(found))
-    console.print(command_suite.describe(found), highlight=False)
+    cli.print_table(command_suite.to_table(found))
+    print(command_suite.describe(found))
     return found
 
 
@@ -287,7 +288,7 @@ def _gate(subjects: list[Subject], options: Options) -> dict[str, Any]:
         numbers = [f"{row[key]:.3f}" for key in ("mean", "q25", "q75") if row["n"]] or ["-"] * 3
         spread = " to ".join(numbers[1:])
         table.add_row(row["group"], row["state"], f"{row['n']:,}", numbers[0], spread)
-    Console().print(table)
+    cli.print_table(table)
     return {"rule": highway_gate.RULE, "robots": count, "gate": rows}
 
 

@@ -1,5 +1,6 @@
 """What all environments share: settings, physics, lanes and a bank of initial states."""
 
+from pathlib import Path
 from typing import no_type_check
 
 import flax.struct
@@ -65,6 +66,13 @@ def _check_lanes(c: Config, atlas: Atlas) -> None:
             f"may begin at {START:g} m"
         )
     goal = float(atlas.end) - c.episode.lane_end
+    if on_lanes and c.episode.start_x[1] >= goal and map_files.is_map(c.terrain.name):
+        toml = Path(c.terrain.name).with_suffix(".toml").name
+        raise ConfigError(
+            f"{toml}: start is too near the map's end: the robot would begin up to "
+            f"{c.episode.start_x[1] - goal:.2g} m past its goal, --episode.lane-end, "
+            f"{c.episode.lane_end:g} m, before the end"
+        )
     if on_lanes and c.episode.start_x[1] >= goal:
         raise ConfigError(
             f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and its goal, "

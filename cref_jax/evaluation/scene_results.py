@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from cref_jax import robot
@@ -184,8 +183,8 @@ def is_passed(outcomes: Sequence[TrialOutcome]) -> bool:
     return count_successes(outcomes) >= PASSED * len(outcomes)
 
 
-def print_tables(verdict: Verdict, console: Console) -> None:
-    """Print the verdict as two tables."""
+def to_tables(verdict: Verdict) -> tuple[Table, Table]:
+    """Build the tables of the verdict: by scene, and by condition."""
     by_scene = Table(title=f"{verdict.passed} of {len(verdict.scenes)} scenes passed")
     for column in ("scene", "trials", "successes", "95 %", "failures"):
         by_scene.add_column(column, justify="left" if column in ("scene", "failures") else "right")
@@ -194,7 +193,6 @@ def print_tables(verdict: Verdict, console: Console) -> None:
             r.title, str(r.trials), str(r.successes), _interval_text(r), _causes_text(r.failures),
             style="green" if r.passed else "",
         )  # fmt: skip
-    console.print(by_scene)
     by_condition = Table(title="the same scenes under conditions")
     for column in ("condition", "trials", "successes", "95 %", "scenes passed", "failures"):
         left = column in ("condition", "failures")
@@ -204,7 +202,7 @@ def print_tables(verdict: Verdict, console: Console) -> None:
             r.name, str(r.trials), str(r.successes), _interval_text(r), str(r.passed),
             _causes_text(r.failures),
         )  # fmt: skip
-    console.print(by_condition)
+    return by_scene, by_condition
 
 
 def _interval_text(result: SceneResult | ConditionResult) -> str:

@@ -1,5 +1,6 @@
 """What an environment cannot be made of is said before a robot is simulated."""
 
+import numpy as np
 import pytest
 import small_world
 
@@ -25,6 +26,16 @@ GAP = {"name": "gap", "levels": 2}
 def test_lanes_and_starts_that_do_not_go_together_are_refused(world, changes, says):
     c = config.override(small_world.C, changes)
     with pytest.raises(ConfigError, match=says):
+        make_world(c, world.physics)
+
+
+def test_a_map_whose_start_leaves_no_way_to_walk_is_named(world, tmp_path):
+    np.save(tmp_path / "hill.npy", np.zeros((60, 40)))
+    (tmp_path / "hill.toml").write_text("cell = 0.1\nstart = [5.5, 2.0]\nscale = 1.0\n")
+    c = config.override(small_world.C, {"terrain": {"name": str(tmp_path / "hill.npy")}})
+    # 0.5 m are left beyond the start at x = 0.75 m; the goal lies 1 m before the end, at 0.25 m,
+    # and robots begin up to 1 m along the lane
+    with pytest.raises(ConfigError, match=r"hill.toml: start .* up to 0.75 m past its goal"):
         make_world(c, world.physics)
 
 
