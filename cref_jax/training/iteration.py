@@ -165,7 +165,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         **{f"loss/{name}": part.mean() for name, part in losses._asdict().items()},
         "train/learning_rate": jnp.ravel(losses.learning_rate)[-1],
         "train/action_std": std.mean(),
-        "train/randomisation": state.ramp.share,
+        **({"train/randomisation": state.ramp.share} if c.randomisation.enabled else {}),
         **_stage_samples(c, state.train.iteration),
     }
     return state, jax.lax.with_sharding_constraint(log, NamedSharding(mesh, P()))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -44,3 +45,14 @@ def test_the_first_episodes_are_randomised_as_much_as_the_ramp_says(ramp):
     assert bool((robots.env.joint_offset == 0.0).all()) == ramp
     np.testing.assert_array_equal(robots.env.spread.mass, np.full(28, 0.0 if ramp else 1.0))
     assert math.isfinite(float(robots.env.body.qpos.sum()))
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_share_of_the_randomisation_is_logged_where_there_is_some(enabled):
+    world, mesh = small_world.world(), iteration.make_mesh()
+    c = dataclasses.replace(small_world.C, network=SMALL)
+    c = config.override(c, {"run": {"num_envs": 28}, "randomisation": {"enabled": enabled}})
+    world = world.replace(config=c)
+    chunk = partial(iteration.chunk, mesh=mesh, iterations=1)
+    _, log = jax.eval_shape(chunk, world, iteration.state_shapes(world, mesh))
+    assert ("train/randomisation" in log) == enabled
