@@ -248,6 +248,18 @@ def test_the_next_tread_is_a_candidate_at_walking_speed():
     assert nearest(whole) > 0.25
 
 
+@pytest.mark.parametrize(("points", "ahead_of_foot"), [(10, [0.33, 0.35]), (30, [])])
+def test_a_strip_at_a_nosing_is_a_candidate_if_few_points_are_enough(points, ahead_of_foot):
+    # down, 0.1 m behind a nosing: of the next tread, 0.1 to 0.4 m ahead, 0.3 m on are left. The
+    # windows from 0.12 and 0.16 m on have 0.30 to 0.36 and 0.30 to 0.40 of it, 15 and 25 points
+    ground = lane(lambda x: -0.2 * max(0.0, math.floor((x - 0.1) / 0.3) + 1.0))
+    c = dataclasses.replace(C, min_points=points)
+    found = footholds.candidates(ground, soles(), jnp.zeros(2), jnp.float32(0.6), c)
+    on_next = found.accepted[0] & (jnp.abs(found.z[0] + 0.2) < 0.01)
+    np.testing.assert_allclose(found.x[0][on_next], ahead_of_foot, atol=1e-6)
+    assert bool((found.accepted[0] & (jnp.abs(found.z[0] + 0.4) < 0.01)).any())
+
+
 def test_a_window_of_remaining_points_has_the_eigenvalues_of_eigh():
     z = np.random.default_rng(3).normal(0.0, 0.02, (60, 5)).astype(np.float32)
     x, y = footholds._lattice(C)
