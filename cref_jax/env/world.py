@@ -66,18 +66,19 @@ def _check_lanes(c: Config, atlas: Atlas) -> None:
             f"may begin at {START:g} m"
         )
     goal = float(atlas.end) - c.episode.lane_end
-    if on_lanes and c.episode.start_x[1] >= goal and map_files.is_map(c.terrain.name):
+    if not on_lanes or c.episode.start_x[1] < goal:
+        return
+    if map_files.is_map(c.terrain.name):
         toml = Path(c.terrain.name).with_suffix(".toml").name
         raise ConfigError(
             f"{toml}: start is too near the map's end: the robot would begin up to "
             f"{c.episode.start_x[1] - goal:.2g} m past its goal, --episode.lane-end, "
             f"{c.episode.lane_end:g} m, before the end"
         )
-    if on_lanes and c.episode.start_x[1] >= goal:
-        raise ConfigError(
-            f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and its goal, "
-            f"--episode.lane-end before its end, is at {goal:g} m"
-        )
+    raise ConfigError(
+        f"--episode.start-x is up to {c.episode.start_x[1]:g} m along the lane, and its goal, "
+        f"--episode.lane-end before its end, is at {goal:g} m"
+    )
 
 
 def _settle_robots(c: Config, physics: Physics) -> Body:
