@@ -135,6 +135,7 @@ RANGES: Ranges = {
             "hip_position": PENALTY,
             "ankle_position": PENALTY,
             "stumble": PENALTY,
+            "wall_contact": PENALTY,
         },
         "event_time": SECONDS,
         "debounce": Within(1, 1000),

@@ -277,9 +277,17 @@ def _reward_snapshot(
         last_air_time=state.gait.last_air_time,
         foothold_distance=footholds.distance(state.candidates, soles.centre),
         unsupported=footholds.count_unsupported(_ground(world, state), soles, c.foothold),
+        walls_touched=_count_walls_touched(world, state, links),
         since_single=jnp.where(single, 0.0, state.since_single + period),
         control_period=jnp.float32(period),
     )
+
+
+def _count_walls_touched(world: World, state: EnvState, links: Links) -> Int[Array, ""]:
+    """Count the contact spheres at a wall, if the reward asks for them."""
+    if not world.config.reward.weights.wall_contact:
+        return jnp.int32(0)
+    return world.physics.at_wall(_ground(world, state), links).sum()
 
 
 def _next_state(

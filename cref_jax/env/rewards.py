@@ -40,6 +40,7 @@ class Snapshot(NamedTuple):
     last_air_time: Float[Array, " F"]  # s, of each foot's last swing, this one included
     foothold_distance: Float[Array, " F"]  # m, d_xz to the nearest candidate; inf: there is none
     unsupported: Int[Array, " F"]  # samples of the sole that are over nothing
+    walls_touched: Int[Array, ""]  # contact spheres at a wall; 0 if their weight is
     since_single: Float[Array, ""]  # s since exactly one foot was down, a lift of one step left out
     control_period: Float[Array, ""]  # s
 
@@ -222,6 +223,11 @@ def stumble(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
     across = jnp.linalg.norm(s.foot_force[:, :2], axis=-1)
     hit = across > c.stumble_ratio * jnp.abs(s.foot_force[:, 2])
     return hit.any().astype(jnp.float32)
+
+
+def wall_contact(s: Snapshot, c: config.Reward, robot: Robot) -> Float[Array, ""]:
+    """Number of contact spheres of feet and shanks that touch a wall; not in Table I."""
+    return s.walls_touched.astype(jnp.float32)
 
 
 TERMS: dict[str, Term] = {

@@ -19,6 +19,7 @@ from cref_jax.physics.mujoco_engine import MujocoEngine
 from cref_jax.physics.records import Backend, Body, Dynamics, Engine, EngineName, SubstepInput
 from cref_jax.robot import kinematics
 
+WALL = 0.7  # least vertical part of a normal on ground, largest on a wall; assumed: 45 degrees
 MAX_DEPTH = 0.05  # m; a foot swinging at 8 m/s is 4 cm inside a wall after one substep
 
 
@@ -85,6 +86,13 @@ class Physics:
         _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
         point = centres - normal * jnp.maximum(distance, -MAX_DEPTH)[:, None]
         return point, jax.vmap(geometry.quat_from_z)(normal)
+
+    def at_wall(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, " P"]:
+        """Check of each contact sphere whether the nearest surface is a wall, and touches it."""
+        spheres = self.robot.spheres
+        centres = kinematics.points(links, spheres.body, spheres.position)
+        _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
+        return (distance < spheres.radius) & (jnp.abs(normal[:, 2]) < WALL)
 
     def is_hit(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, ""]:
         """Check whether an end of pelvis, torso, head or a thigh touches the ground.

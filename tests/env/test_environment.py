@@ -13,9 +13,11 @@ import pytest
 from compilation import AS_SHIPPED
 from small_world import ROBOTS, C, assert_equal, one, put
 
-from cref_jax import config
+from cref_jax import config, terrain
 from cref_jax.env import environment, footholds, gait, observations, rewards
 from cref_jax.physics.simulation import Physics
+from cref_jax.robot import kinematics
+from cref_jax.terrain import cross_section
 
 LENGTH = C.terrain.lane_length
 
@@ -285,3 +287,44 @@ def test_all_robots_step_as_each_would_alone(world, robots):
         both, ended = (ours, theirs), ended + int(said.ending.timeout.sum())
     assert ended == 1
     assert float(ours.command[2, 0]) != float(state.command[2, 0])
+
+
+@pytest.mark.parametrize(
+    ("gap", "lift", "expected"), [(0.995, 0.05, 1), (1.005, 0.05, 0), (0.995, 0.0, 0)]
+)
+def test_a_sphere_is_at_a_wall_if_that_is_the_nearest_it_touches(
+    world, robots, gap, lift, expected
+):
+    # the foremost sphere is a little less than its radius from a riser, or more; where it stands,
+    # the ground is nearer
+    physics, state = world.physics, one(robots)
+    spheres = physics.robot.spheres
+    qpos = state.body.qpos.at[:2].set(0.0).at[3:7].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
+    centres = lambda qpos: kinematics.points(
+        physics.links(state.body._replace(qpos=qpos)), spheres.body, spheres.position
+    )
+    front = int(np.argmax(centres(qpos)[:, 0]))
+    x, _, z = centres(qpos)[front]
+    radius = float(spheres.radius[front])
+    qpos = qpos.at[0].set(1.0 - x - gap * radius).at[2].add(lift + 0.99 * radius - z)
+    ground = terrain.from_heights(0.2 * (jnp.arange(100) >= 50)[:, None], 0.02)
+    links = physics.links(state.body._replace(qpos=qpos))
+    assert int(physics.at_wall(ground, links)[front]) == expected
+
+
+def test_walls_are_looked_for_if_they_cost_something(world, step, robots):
+    costly = config.override(world.config, {"reward": {"weights": {"wall_contact": -5.0}}})
+    stairs = np.flatnonzero(np.asarray(robots.kind) == world.lanes.kinds.index("stairs_up"))[0]
+    tile = world.lanes.tile(2, int(robots.kind[stairs]), int(robots.variant[stairs]))
+    riser = cross_section.from_lane(tile).left[1]
+    links = world.physics.links(one(robots.body, stairs))
+    spheres = world.physics.robot.spheres
+    toes = kinematics.points(links, spheres.body, spheres.position)[:, 0].max()
+    x = robots.body.qpos[:, 0].at[stairs].add(riser - toes)  # into the riser by a radius
+    state = put(robots, x=x).replace(level=robots.level.at[stairs].set(2))
+    _, seen = step(world, state, still(robots))
+    assert (seen.measures.terms["wall_contact"] == 0.0).all()
+    _, seen = step(world.replace(config=costly), state, still(robots))
+    found = seen.measures.terms["wall_contact"]
+    assert float(found[stairs]) <= -5.0 and float(found[stairs]) % -5.0 == 0.0
+    assert (np.delete(found, stairs) == 0.0).all()

@@ -68,6 +68,7 @@ def perfect(x2: robot.Robot) -> rewards.Snapshot:
         last_air_time=jnp.zeros(2),
         foothold_distance=jnp.full(2, jnp.inf),
         unsupported=jnp.zeros(2, jnp.int32),
+        walls_touched=jnp.int32(0),
         since_single=jnp.float32(9.0),
         control_period=jnp.float32(PERIOD),
     )
@@ -334,6 +335,11 @@ def test_stumble(x2):
     check(x2, "stumble", 1.0, foot_force=[[0.0, 0.0, 9.0], [3.0, 4.0, -0.9]])
     check(x2, "stumble", 0.0, foot_force=[[0.0, 0.0, 9.0], [3.0, 4.0, 1.0]])
     check(x2, "stumble", 0.0, foot_force=np.zeros((2, 3)))  # a foot in the air hits nothing
+
+
+def test_wall_contact(x2):
+    check(x2, "wall_contact", 3.0, walls_touched=3)
+    check(x2, "wall_contact", 0.0, walls_touched=0)
 
 
 def test_a_perfect_stand_has_every_reward_and_no_penalty(x2):
