@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 import tyro
 from jax.sharding import Mesh
 
@@ -25,7 +24,7 @@ from cref_jax.errors import ConfigError
 from cref_jax.evaluation import walking
 from cref_jax.physics.records import EngineName
 from cref_jax.physics.simulation import resolve_engine
-from cref_jax.policy import learner_file, sources, trained, warm_start
+from cref_jax.policy import sources, trained, warm_start
 from cref_jax.rendering import map_plot
 from cref_jax.robot import ROBOTS, fill_in
 from cref_jax.system import jax_setup, parallel
@@ -35,6 +34,7 @@ from cref_jax.terrain.kind_files import terrain_names
 from cref_jax.training import (
     devices,
     distillation,
+    imitation,
     iteration,
     processes,
     resumption,
@@ -47,8 +47,6 @@ from cref_jax.training.progress import Reporter, SilentReporter
 from cref_jax.training.run_lock import lock
 
 PROGRAM = "python -m cref_jax.train"
-CRITIC_FIRST = 200  # iterations after --init without a critic; after 20 its errors made robots fall
-NOT_OF_THE_ACTOR = ("critic", "critic_sees", "initial_std", "min_std")  # of a network's settings
 
 
 @dataclass(frozen=True)
@@ -158,8 +156,11 @@ def parse(arguments: list[str]) -> tuple[Options, Config]:
     c = distillation.fill_in(c)
     if options.resume:
         sources.check_robot(options.run_dir or Path(), c.robot.name)
+    if init and options.resume:
+        raise ConfigError("give --init or --resume, not both")
     if init:
-        c = _with_init(c, options)
+        c = warm_start.adapt_settings(c, init)
+    warm_start.check_teachers(c, init, options.resume)
     limits.check(c)
     if resumed:
         resumption.check_settings(resumed, base, c)
@@ -182,6 +183,7 @@ def train(options: Options, c: Config) -> None:
     threads = max(parallel.cores() // len(mesh.local_devices), 1)
     # what is wrong with the terrain is said before anything is written
     world = processes.replicate(build_world(c, options.engine, threads), mesh)
+    imitation.number_kinds(c.distillation, world.lanes)
     name = run_dir.reserve if processes.is_first() else run_dir.ROOT.joinpath
     run = options.run_dir or name(_name(options))
     options = dataclasses.replace(options, run_dir=run)
@@ -298,13 +300,9 @@ def _first_state(
     processes.wait_for_all()
     state = start(world)
     if options.init:
-        policy = sources.load(options.init, world)
-        if _has_critic(options.init, world.config):
-            average = jax.tree.map(jnp.copy, policy.train.average)  # the actor gives its own away
-            learned = policy.train.replace(average=average, iteration=state.train.iteration)
-        else:
-            learned = warm_start.start_from_policy(state.train, policy)
-        return state.replace(train=processes.replicate(learned, mesh))
+        learned, taught = warm_start.start(state, options.init, world)
+        learned, taught = processes.replicate((learned, taught), mesh)
+        return state.replace(train=learned, teachers=taught)
     if not options.resume:
         return state
     return resumption.restore(steps, state, trainer.describe_sharding(state, mesh))
@@ -352,36 +350,6 @@ def _with_short_options(c: Config, options: Options) -> Config:
     short = {name: getattr(options, name) for name in ("num_envs", "iterations", "seed")}
     given = {name: value for name, value in short.items() if value is not None}
     return dataclasses.replace(c, run=dataclasses.replace(c.run, **given))
-
-
-def _with_init(c: Config, options: Options) -> Config:
-    """Adapt the settings to a run that begins as --init.
-
-    Raises:
-        ConfigError: it has another network, or there is something to resume as well.
-    """
-    if options.resume:
-        raise ConfigError("give --init or --resume, not both")
-    if c.network.variant == "hpl":
-        raise ConfigError("--init: a run of --network.variant hpl begins with a teacher of its own")
-    sources.check_robot(options.init or Path(), c.robot.name)
-    theirs, ours = sources.read_config(options.init or Path()).network, c.network
-    for name, value in dataclasses.asdict(theirs).items():
-        if name not in NOT_OF_THE_ACTOR and value != getattr(ours, name):
-            raise ConfigError(
-                f"--init {options.init} has another network: {name} is {value}, and here "
-                f"{getattr(ours, name)}; set --network.{name.replace('_', '-')}"
-            )
-    first = c.ppo.critic_first or (0 if _has_critic(options.init, c) else CRITIC_FIRST)
-    return dataclasses.replace(c, ppo=dataclasses.replace(c.ppo, critic_first=first))
-
-
-def _has_critic(init: Path, c: Config) -> bool:
-    """Return whether `init` holds everything that is trained, not the actor alone."""
-    theirs = sources.read_config(init)
-    read_out = theirs.ppo.readout_weight > 0.0, c.ppo.readout_weight > 0.0
-    whole = sources.is_run(init) or learner_file.is_learner(init)
-    return whole and theirs.network == c.network and read_out[0] == read_out[1]
 
 
 def _name(options: Options) -> str:

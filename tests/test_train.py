@@ -29,6 +29,7 @@ from cref_jax.training.progress import Reporter
 TINY = ["--terrain", "flat", "--experiment", "smoke", "--device", "cpu"]
 TINY += ["--no-tensorboard", "--no-evaluate"]
 BUNDLED = str(sources.bundled_policy())
+TEACHERS = "--distillation.teachers"
 
 
 def run(folder: Path, *more: str) -> None:
@@ -286,6 +287,14 @@ def state_of(folder: Path) -> list[np.ndarray]:
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],
             "has another network: ",
         ),
+        (
+            ["--terrain", "gap", "--init", BUNDLED, TEACHERS, "gap=mixed"],
+            "--distillation.teachers: --ppo.imitation-weight must be above 0",
+        ),
+        (
+            ["--terrain=gap", "--init", BUNDLED, "--ppo.imitation-weight=1", f"{TEACHERS}=gap=b"],
+            "there is no run or policy b; bundled are mixed, robust",
+        ),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(
@@ -407,6 +416,23 @@ def test_a_run_begins_as_another_run_with_all_that_it_learned(first, tmp_path, a
     critics = [jax.tree.leaves(t.params.critic) for t in (before, after)]
     moved = max(float(np.abs(a - b).max()) for a, b in zip(*critics, strict=True))
     assert 0.0 < moved < 0.1
+
+
+@pytest.mark.slow
+def test_a_run_learns_from_its_teachers_and_has_them_still_when_it_is_resumed(
+    first: Path, tmp_path: Path
+):
+    shutil.copytree(first, tmp_path / "teacher")
+    second, taught = tmp_path / "second", f"flat={tmp_path / 'teacher'}"
+    asks = ("--ppo.imitation-weight", "1", TEACHERS, taught)
+    run(second, "--init", str(first), *asks, "--iterations", "2")
+    shutil.rmtree(tmp_path / "teacher")
+    run(second, "--resume", "--iterations", "3")
+    log = [json.loads(line) for line in (second / "log.jsonl").open()]
+    assert [line["iteration"] for line in log] == [1, 2, 3]
+    apart = [line["teacher_kl/flat"] for line in log]
+    assert max(apart) > min(apart) > 0.0  # the teacher is the average, and the policy goes on
+    assert sources.summarize(second).endswith(f", taught by {taught}")
 
 
 @pytest.mark.slow

@@ -49,6 +49,7 @@ class PPO:
     estimator_weight: float = 1.0  # of the velocity estimator's L2 loss
     readout_weight: float = 0.0  # of predicting m_t from the actor's features; the paper: 0
     mirror_weight: float = 0.0  # of the symmetry loss; the paper: 0
+    imitation_weight: float = 0.0  # of the distance to the teachers (nats); the paper: 0
     gamma: float = 0.99
     lam: float = 0.95
     learning_rate: float = 1e-3
@@ -62,10 +63,12 @@ class PPO:
 
 @dataclass(frozen=True)
 class Distillation:
-    """How a student of variant hpl learns, in a run whose first iterations are its teacher's."""
+    """Who teaches, and how a student of variant hpl learns after its teacher's iterations."""
 
     teacher_iterations: int = 0  # in which PPO trains the teacher; 0: nine tenths of the run's
     learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
+    teachers: tuple[str, ...] = ()
+    """KIND=POLICY: whom to imitate on lanes of this kind; on all others it is --init"""
 
 
 @dataclass(frozen=True)

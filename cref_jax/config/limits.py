@@ -209,6 +209,7 @@ RANGES: Ranges = {
         "estimator_weight": WEIGHT,
         "readout_weight": WEIGHT,
         "mirror_weight": WEIGHT,
+        "imitation_weight": WEIGHT,
         "gamma": SHARE,
         "lam": SHARE,
         "learning_rate": Within(1e-8, 1),

@@ -109,7 +109,8 @@ def summarize(path: Path) -> str:
 def _line(path: Path, c: Config, iteration: int, samples: int) -> str:
     sees = "blind" if c.network.variant == "blind" else f"network {c.network.variant}"
     length = describe_samples(c, iteration, samples)
-    return f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {length}"
+    line = f"{path}: {name_robot(c.robot.name)}, {sees}, trained on {c.terrain.name} for {length}"
+    return f"{line}, taught by {', '.join(taught)}" if (taught := c.distillation.teachers) else line
 
 
 def load(path: Path, world: World) -> TrainedPolicy:

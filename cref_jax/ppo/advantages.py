@@ -46,6 +46,7 @@ def prepare_batch(
         carry=clean.carry,
         sight=clean.sight,
         twin=clean.twin,
+        target=clean.target,
     )
 
 

@@ -32,3 +32,10 @@ def kl(
     growth = new_log_std - log_std
     shift = (mean - new_mean) * jnp.exp(-new_log_std)
     return jnp.sum(growth + 0.5 * (jnp.exp(-2.0 * growth) + jnp.square(shift) - 1.0), axis=-1)
+
+
+def kl_of_means(
+    mean: Float[Array, "*n J"], new_mean: Float[Array, "*n J"], log_std: Float[Array, " J"]
+) -> Float[Array, "*n"]:
+    """Compute the same of two Gaussians of equal deviations: sum of (m - m')^2 / (2 s^2)."""
+    return 0.5 * jnp.sum(jnp.square((mean - new_mean) * jnp.exp(-log_std)), axis=-1)

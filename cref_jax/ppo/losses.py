@@ -30,12 +30,17 @@ def loss(
     askew = jnp.zeros_like(value)
     if networks.mirror is not None:
         askew = asymmetry_error(params.actor, batch, policy.mean, networks.actor, networks.mirror)
+    apart = jnp.zeros_like(value)
+    if batch.target is not None:
+        fixed = jax.lax.stop_gradient(policy.log_std)  # to explore more is not to imitate better
+        apart = gaussian.kl_of_means(batch.target, policy.mean, fixed)
     parts = Losses(
         surrogate=mean(surrogate_loss(ratio, batch.advantage, c.clip)),
         value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),
         velocity=mean(error),
         readout=mean(misread),
         asymmetry=mean(askew),
+        teacher_kl=mean(apart),
         entropy=gaussian.entropy(policy.log_std),
         kl=mean(divergence),
         clipped=mean((jnp.abs(ratio - 1.0) > c.clip).astype(ratio.dtype)),
@@ -46,6 +51,7 @@ def loss(
         + c.estimator_weight * parts.velocity
         + c.readout_weight * parts.readout
         + c.mirror_weight * parts.asymmetry
+        + c.imitation_weight * parts.teacher_kl
         - c.entropy_weight * parts.entropy
     )
     return total, jax.lax.stop_gradient(parts)

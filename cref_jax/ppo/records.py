@@ -69,6 +69,7 @@ class Batch(NamedTuple):
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None
     twin: PyTree[Float[Array, "E ?H"]] = None
     twin_obs: Float[Array, "T E O"] | None = None  # mirrored observations
+    target: Float[Array, "T E J"] | None = None  # the teachers' mean action, if there are any
 
 
 class Losses(NamedTuple):
@@ -79,6 +80,7 @@ class Losses(NamedTuple):
     velocity: Float[Array, "*n"]  # m^2/s^2
     readout: Float[Array, "*n"]  # in units of each target's variance
     asymmetry: Float[Array, "*n"]  # of the mean action, squared
+    teacher_kl: Float[Array, "*n"]  # KL(teacher || policy) at the policy's deviations, nats
     entropy: Float[Array, "*n"]  # nats
     kl: Float[Array, "*n"]  # KL(behaviour policy || current policy), nats
     clipped: Float[Array, "*n"]  # share of samples whose ratio is outside the clip range
@@ -127,3 +129,4 @@ class Rollout(NamedTuple):
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # further inputs of the actor, unnormalised
     twin: PyTree[Float[Array, "E ?H"]] = None  # memory of the mirrored actor before the first step
     guide: PyTree[Shaped[Array, "T E *?n"]] = None  # what a teacher sees besides, unnormalised
+    target: Float[Array, "T E J"] | None = None  # the teachers' mean action, if there are any

@@ -20,7 +20,8 @@ from jaxtyping import Array, Float, Int, PyTree
 from cref_jax import config, network, ppo
 from cref_jax.env.world import World
 from cref_jax.ppo import Losses
-from cref_jax.training import distillation, mirror, randomization_ramp, rollout
+from cref_jax.training import distillation, imitation, mirror, randomization_ramp, rollout
+from cref_jax.training.imitation import Teacher
 from cref_jax.training.randomization_ramp import Ramp
 
 Log = dict[str, Float[Array, "*n"]]  # by name, one number per iteration
@@ -36,6 +37,7 @@ class RunState:
     train: ppo.TrainState
     robots: rollout.Robots
     ramp: Ramp
+    teachers: tuple[Teacher, ...] = ()
 
 
 def make_mesh(count: int = 1) -> Mesh:
@@ -51,7 +53,7 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
 
     def start(world: World, key: Array) -> rollout.Robots:
         robots = rollout.start(world, _robot_keys(key, c.run.num_envs // mesh.size))
-        robots = rollout.with_teachers(robots) if c.network.variant == "hpl" else robots
+        robots = rollout.with_teachers(robots) if _has_teacher(c) else robots
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
     sharded_start = jax.shard_map(
@@ -74,7 +76,15 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
     train, ramp = jax.lax.with_sharding_constraint(
         (train, randomization_ramp.initial_ramp(c.randomisation)), (whole, whole)
     )
-    return RunState(train, robots, ramp)
+    return RunState(train, robots, ramp, _untrained_teachers(train, c))
+
+
+def _untrained_teachers(train: ppo.TrainState, c: config.Config) -> tuple[Teacher, ...]:
+    """Make room for the teachers, if the run has any: what they know comes with `--init`."""
+    if not c.ppo.imitation_weight:
+        return ()
+    count = 1 + len(imitation.list_teachers(c.distillation))
+    return count * (Teacher(train.params.actor, train.statistics.obs),)
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
@@ -136,7 +146,8 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
         world: World, state: RunState, key: Array
     ) -> tuple[RunState, Losses | distillation.Losses, rollout.Trace]:
         robots = rollout.with_randomization(state.robots, state.ramp.share)
-        teach = distillation.learn if c.network.variant == "hpl" else _reinforce
+        teach = functools.partial(_reinforce, teachers=state.teachers)
+        teach = distillation.learn if c.network.variant == "hpl" else teach
         key_robots, key_update = jax.random.split(key)
         keys = rollout.Keys(
             robots=_robot_keys(key_robots, robots.begins.size),
@@ -178,9 +189,17 @@ def _reinforce(
     robots: rollout.Robots,
     keys: rollout.Keys,
     axis: str,
+    teachers: tuple[Teacher, ...] = (),
 ) -> tuple[ppo.TrainState, rollout.Robots, Losses, rollout.Trace]:
-    """Collect a horizon of experience and learn from it by PPO."""
+    """Collect a horizon of experience and learn from it by PPO, and from teachers if there are."""
+    taught = robots.memory.teacher
     robots, experience, trace = rollout.collect(world, nets, train, robots, keys.robots)
+    if teachers:
+        asked = imitation.ask_teachers(world, nets.actor, teachers, taught, experience)
+        taught, target, teacher_kl = asked
+        experience = experience._replace(target=target)
+        trace = trace._replace(teacher_kl=teacher_kl)
+        robots = robots.replace(memory=robots.memory._replace(teacher=taught))
     c = world.config.ppo
     train, losses = ppo.update(train, experience, keys.update, c, nets.functions, axis)
     return train, robots, losses, trace
@@ -208,10 +227,13 @@ def _stage_samples(c: config.Config, iteration: Int[Array, ""]) -> Log:
 def partition(world: World) -> RunState:
     """Return the partition specs of a run's state: robots are sharded, the rest is replicated."""
     c = world.config
-    robots = rollout.partition(
-        AXIS, c.network, c.ppo.mirror_weight > 0.0, c.network.variant == "hpl"
-    )
-    return RunState(train=P(), robots=robots, ramp=P())
+    robots = rollout.partition(AXIS, c.network, c.ppo.mirror_weight > 0.0, _has_teacher(c))
+    return RunState(train=P(), robots=robots, ramp=P(), teachers=P())
+
+
+def _has_teacher(c: config.Config) -> bool:
+    """Return whether a teacher acts beside the policy that is trained."""
+    return c.network.variant == "hpl" or c.ppo.imitation_weight > 0.0
 
 
 def _robot_keys(key: Array, count: int) -> Array:
@@ -243,8 +265,12 @@ def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) ->
         "foothold/distance": masked_mean(jnp.where(placed, distance, 0.0), placed),
         "foothold/empty": masked_mean(~jnp.isfinite(distance), measures.touchdown),
     }
+    if trace.teacher_kl is not None:
+        log["teacher_kl/mean"] = trace.teacher_kl.mean()
     for number, kind in enumerate(kinds):
         here = measures.kind == number
         log[f"level/{kind}"] = masked_mean(measures.rank, here)
         log[f"fell/{kind}"] = masked_mean(ending.terminated, here & over)
+        if trace.teacher_kl is not None:
+            log[f"teacher_kl/{kind}"] = masked_mean(trace.teacher_kl, here)
     return log

@@ -27,6 +27,7 @@ SHOWN = {  # name in the log: name on the screen and unit
     "walk/reward": ("reward", "per step"),
     "train/action_std": ("action deviation", ""),
     "loss/kl": ("KL", "nats"),
+    "teacher_kl/mean": ("KL from the teachers", "nats"),
     "loss/imitation": ("imitation error", "over all joints"),
     "train/teacher_samples": ("samples of the teacher", ""),
     "train/student_samples": ("samples of the student", ""),

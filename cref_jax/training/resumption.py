@@ -58,7 +58,8 @@ def restore(steps: Checkpoints, state: RunState, here: dict[str, int]) -> RunSta
     if changes:
         print(changes)
     print("so what was learned is kept, the robots start anew, and the run is no longer the same")
-    return steps.restore(state, parts=("train", "ramp"))[0]
+    learned = ("train", "ramp", "teachers") if state.teachers else ("train", "ramp")
+    return steps.restore(state, parts=learned)[0]
 
 
 @jax.jit

@@ -84,6 +84,7 @@ class Trace(NamedTuple):
     reward: Float[Array, "T E"]
     ending: Ending
     measures: environment.Measures
+    teacher_kl: Float[Array, "T E"] | None = None  # as in ppo.Losses, before the update
 
 
 def partition(

@@ -219,6 +219,7 @@ def test_the_loss_worked_by_hand():
         "velocity": 5.0,
         "readout": 0.0,
         "asymmetry": 0.0,
+        "teacher_kl": 0.0,
         "entropy": 1.418939,
         "kl": 0.005,
         "clipped": 0.0,
@@ -277,6 +278,20 @@ def test_an_update_makes_the_policy_more_symmetric():
     before, now = params.actor, after.params.actor
     assert (jnp.abs(now["b"]) < jnp.abs(before["b"])).all()
     np.testing.assert_allclose(now["w"], before["w"], atol=1e-6)
+
+
+def test_a_teacher_two_deviations_away_costs_two_nats_whatever_the_deviation_does():
+    # W o + b of the toy and a teacher 2 s beside it in the second joint: (2 s)^2 / (2 s^2) = 2
+    networks, params = mirrored_toy()
+    networks = networks._replace(mirror=None)
+    batch = judge(some_rollout())
+    _, said = networks.actor(params.actor, (), batch.obs, None, None)
+    batch = batch._replace(target=said.mean + jnp.array([0.0, 2.0]))  # s = exp(0)
+    c = dataclasses.replace(C, imitation_weight=3.0)
+    with_it, parts = losses.loss(params, batch, c, networks)
+    without, _ = losses.loss(params, batch, C, networks)
+    np.testing.assert_allclose(parts.teacher_kl, 2.0, rtol=1e-5)
+    np.testing.assert_allclose(with_it - without, 3.0 * 2.0, rtol=1e-4)
 
 
 def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():

@@ -1,0 +1,194 @@
+"""A policy learns from one teacher per kind of lane, and each teacher is asked on its own alone."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_world
+import tiny_policy
+from tiny_policy import SMALL
+
+from cref_jax import config, ppo
+from cref_jax.errors import ConfigError
+from cref_jax.policy import sources, warm_start
+from cref_jax.training import imitation, iteration, resumption, rollout
+from cref_jax.training.checkpoint import Checkpoints
+from cref_jax.training.imitation import Teacher
+
+T, E = 4, 16  # two robots on each kind of small_world's turns
+
+
+def settings(*teachers: str, **ppo_settings: float) -> config.Config:
+    changes = {
+        "run": {"num_envs": E},
+        "ppo": {"horizon": T, "minibatches": 2, "imitation_weight": 1.0, **ppo_settings},
+        "distillation": {"teachers": list(teachers)},
+    }
+    return dataclasses.replace(config.override(small_world.C, changes), network=SMALL)
+
+
+def of(*teachers: str) -> config.Distillation:
+    return config.Distillation(teachers=teachers)
+
+
+def test_kinds_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
+    assert world.lanes.kinds[:3] == ("flat", "rough", "slope")
+    named = of("slope=b", "flat=a", "gap=b")
+    assert imitation.list_teachers(named) == ["b", "a"]
+    by_kind = dict(zip(world.lanes.kinds, imitation.number_kinds(named, world.lanes), strict=True))
+    assert (by_kind.pop("slope"), by_kind.pop("gap"), by_kind.pop("flat")) == (1, 1, 2)
+    assert set(by_kind.values()) == {0}
+
+
+@pytest.mark.parametrize(
+    ("teachers", "says"),
+    [
+        (("flat",), "'flat' is not KIND=POLICY"),
+        (("=a",), "'=a' is not KIND=POLICY"),
+        (("flat=a", "flat=b"), "two for 'flat'; give one"),
+        (("stair_up=a",), "unknown kind of lane 'stair_up'; did you mean 'stairs_up'?"),
+    ],
+)
+def test_a_wrong_teacher_is_named(world, teachers, says):
+    with pytest.raises(ConfigError, match=says):
+        imitation.number_kinds(of(*teachers), world.lanes)
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """A world whose slopes have a teacher of their own, and a run's state in it."""
+    world = small_world.world().replace(config=settings("slope=other"))
+    state = jax.jit(iteration.initial_state)(world)
+    first, second = (Teacher(p.train.params.actor, p.train.statistics.obs) for p in policies())
+    return world, state.replace(teachers=(first, second))
+
+
+def policies():
+    first = tiny_policy.policy("full")
+    actor = jax.tree.map(lambda x: 0.8 * x - 0.01, first.train.params.actor)
+    train = first.train.replace(params=first.train.params._replace(actor=actor))
+    return first, first._replace(train=train)
+
+
+def test_each_teacher_says_what_it_would_do_on_its_own_lanes_and_remembers(taught):
+    world, state = taught
+    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
+    slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
+    assert slopes.sum() == E // len(world.lanes.turns)
+    robots, memory = state.robots, state.robots.memory.teacher
+    alone = [memory, memory]
+    collect = jax.jit(lambda robots, keys: rollout.collect(world, nets, state.train, robots, keys))
+    ask = jax.jit(lambda *a: imitation.ask_teachers(world, nets.actor, state.teachers, *a))
+    for seed in (1, 2):
+        robots, seen, _ = collect(robots, jax.random.split(jax.random.key(seed), E))
+        memory, target, apart = ask(memory, seen)
+        for number, teacher in enumerate(state.teachers):
+            obs = ppo.normalize(teacher.obs, seen.obs)
+            alone[number], said = nets.actor.apply(
+                teacher.actor, alone[number], obs, seen.begins, seen.sight
+            )
+            own = slopes if number else ~slopes
+            np.testing.assert_allclose(target[:, own], said.mean[:, own], atol=1e-5)
+            assert np.abs(target[:, ~own] - said.mean[:, ~own]).max() > 0.01
+            np.testing.assert_allclose(memory.gru[own], alone[number].gru[own], atol=1e-5)
+        # sum over joints of (m - m')^2 / (2 s^2)
+        shift = (target - seen.mean) * np.exp(-seen.log_std)
+        np.testing.assert_allclose(apart, 0.5 * np.square(shift).sum(axis=-1), rtol=1e-4)
+
+
+def test_who_learns_from_itself_is_where_it_should_be(taught):
+    world, state = taught
+    own = Teacher(state.train.params.actor, state.train.statistics.obs)
+    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
+    keys = jax.random.split(jax.random.key(1), E)
+    collect = jax.jit(lambda robots: rollout.collect(world, nets, state.train, robots, keys))
+    _, seen, _ = collect(state.robots)
+    *_, apart = imitation.ask_teachers(
+        world, nets.actor, (own, own), state.robots.memory.teacher, seen
+    )
+    assert float(jnp.abs(apart).max()) < 1e-6
+
+
+def test_an_iteration_brings_the_policy_nearer_and_leaves_the_teachers_alone(taught):
+    world, state = taught
+    keen = settings("slope=other", imitation_weight=100.0, learning_rate=0.003, target_kl=10.0)
+    world = world.replace(config=keen)
+    before = jax.tree.map(np.asarray, state.teachers)
+    copied = jax.tree.map(lambda x: x.copy() if hasattr(x, "copy") else x, state)
+    after, log = iteration.chunk(world, copied, iteration.make_mesh(), 20)
+    jax.tree.map(np.testing.assert_array_equal, before, jax.tree.map(np.asarray, after.teachers))
+    for kind in ("flat", "slope"):
+        apart = log[f"teacher_kl/{kind}"]
+        assert float(apart[-1]) < 0.5 * float(apart[0]), kind
+    assert float(log["loss/teacher_kl"][-1]) < 0.5 * float(log["loss/teacher_kl"][0])
+
+
+def test_without_teachers_nothing_is_said_of_them(world):
+    c = dataclasses.replace(settings(imitation_weight=0.0), network=SMALL)
+    state = jax.eval_shape(iteration.initial_state, world.replace(config=c))
+    assert state.teachers == () and state.robots.memory.teacher is None
+    _, log = jax.eval_shape(
+        lambda w, s: iteration.chunk(w, s, iteration.make_mesh(), 1), world.replace(config=c), state
+    )
+    assert not [name for name in log if name.startswith("teacher_kl")]
+
+
+def test_a_resumed_run_has_the_teachers_that_it_had(taught, tmp_path):
+    _, state = taught
+    few = small_world.world().replace(
+        config=config.override(settings("slope=other"), {"run": {"num_envs": 8}})
+    )
+    with Checkpoints(tmp_path) as steps:
+        steps.save(1, state, {"num_envs": E, "shares": 1})
+        fresh = jax.jit(iteration.initial_state)(few)
+        back = resumption.restore(steps, fresh, {"num_envs": 8, "shares": 1})
+    assert back.robots.begins.shape == (8,)
+    jax.tree.map(np.testing.assert_array_equal, back.teachers, state.teachers)
+
+
+def test_the_first_teacher_is_what_the_run_begins_as(taught, monkeypatch):
+    world, state = taught
+    first, second = policies()
+    by_name = {Path("begin"): first, Path("other"): second}
+    monkeypatch.setattr(sources, "load", lambda path, _: by_name[path])
+    monkeypatch.setattr(warm_start, "has_critic", lambda *_: False)
+    learned, teachers = warm_start.start(state, Path("begin"), world)
+    for teacher, policy in zip(teachers, (first, second), strict=True):
+        small_world.assert_equal(teacher.actor, policy.train.params.actor)
+        small_world.assert_equal(teacher.obs, policy.train.statistics.obs)
+    small_world.assert_equal(learned.params.actor, first.train.params.actor)
+    assert learned.teacher is None
+
+
+def test_a_teacher_of_another_network_is_refused(monkeypatch):
+    c = settings("slope=other")
+    wider = dataclasses.replace(c, network=dataclasses.replace(SMALL, gru=9))
+    monkeypatch.setattr(sources, "read_config", lambda _: wider)
+    monkeypatch.setattr(sources, "check_robot", lambda *_: None)
+    with pytest.raises(ConfigError, match=r"teachers other has another network: gru is 9, .* 7"):
+        warm_start.check_teachers(c, Path("begin"), resumes=False)
+    warm_start.check_teachers(c, None, resumes=True)  # the checkpoint has them
+
+
+@pytest.mark.parametrize(
+    ("weight", "teachers", "variant", "says"),
+    [
+        (0.0, ("flat=a",), "full", "--ppo.imitation-weight must be above 0"),
+        (1.0, (), "full", "say --init POLICY"),
+        (1.0, (), "hpl", "must be 0 with --network.variant hpl"),
+    ],
+)
+def test_teachers_without_a_loss_and_a_loss_without_a_teacher_are_refused(
+    weight, teachers, variant, says
+):
+    c = settings(*teachers, imitation_weight=weight)
+    c = dataclasses.replace(c, network=network_of(variant))
+    with pytest.raises(ConfigError, match=says):
+        warm_start.check_teachers(c, None, resumes=False)
+
+
+def network_of(variant: config.Variant) -> config.Network:
+    return dataclasses.replace(SMALL, variant=variant)
