@@ -32,7 +32,7 @@ class RewardWeights:
     hip_position: float = -7.0
     ankle_position: float = -10.0
     stumble: float = -10.0
-    wall_contact: float = 0.0  # not in Table I
+    wall_contact: float = 0.0  # per contact sphere at a wall; not in Table I
 
 
 @dataclass(frozen=True)
