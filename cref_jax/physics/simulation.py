@@ -81,18 +81,23 @@ class Physics:
         A plane is at most `MAX_DEPTH` above its sphere's centre: a sphere thrown deep into a wall
         comes out at the speed of a collision, not of an explosion.
         """
-        spheres = self.robot.spheres
-        centres = kinematics.points(self.links(body), spheres.body, spheres.position)
-        _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
+        centres, normal, distance = self._find_surfaces(ground, self.links(body))
         point = centres - normal * jnp.maximum(distance, -MAX_DEPTH)[:, None]
         return point, jax.vmap(geometry.quat_from_z)(normal)
 
     def at_wall(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, " P"]:
         """Check of each contact sphere whether the nearest surface is a wall, and touches it."""
+        _, normal, distance = self._find_surfaces(ground, links)
+        return (distance < self.robot.spheres.radius) & (jnp.abs(normal[:, 2]) < WALL)
+
+    def _find_surfaces(
+        self, ground: terrain.Terrain, links: kinematics.Links
+    ) -> tuple[Float[Array, "P 3"], Float[Array, "P 3"], Float[Array, " P"]]:
+        """Compute each contact sphere's centre, and the nearest surface's normal and distance."""
         spheres = self.robot.spheres
         centres = kinematics.points(links, spheres.body, spheres.position)
         _, normal, distance = jax.vmap(lambda p: terrain.closest_point(ground, p))(centres)
-        return (distance < spheres.radius) & (jnp.abs(normal[:, 2]) < WALL)
+        return centres, normal, distance
 
     def is_hit(self, ground: terrain.Terrain, links: kinematics.Links) -> Bool[Array, ""]:
         """Check whether an end of pelvis, torso, head or a thigh touches the ground.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from cref_jax import ppo
-from cref_jax.config import Config
+from cref_jax.config import HPL, Config
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.policy import learner_file, sources
@@ -44,7 +44,7 @@ def check_teachers(c: Config, init: Path | None, resumes: bool) -> None:
         if names:
             raise ConfigError("--distillation.teachers: --ppo.imitation-weight must be above 0")
         return
-    if c.network.variant in ("hpl", "hpl_teacher"):
+    if c.network.variant in HPL:
         raise ConfigError(
             f"--ppo.imitation-weight must be 0 with --network.variant {c.network.variant}"
         )
