@@ -1,9 +1,9 @@
 """Trials: each robot starts anew and is followed until it first reaches its lane's end or fails.
 
 Each device steps a block of robots, and where a trial ends the next one starts. A trial's slot in a
-block follows from its number, so its outcome depends only on the seed, its number and its lane, not
-on the number of trials or of devices. (Another block size, as on another device, rounds matrix
-products differently.)
+block follows from its number and its row in the table, so its outcome depends only on the seed, its
+number and its lane, not on the number of trials or of devices. (Another block size, as on another
+device, rounds matrix products differently.)
 """
 
 import collections
@@ -214,8 +214,8 @@ class _Slots:
     """The trial in each slot of the blocks, and the trials waiting for a slot."""
 
     def __init__(self, number: Int[np.ndarray, " N"], block: int) -> None:
-        row = number % block
-        self._waiting = [collections.deque(np.flatnonzero(row == k)) for k in range(block)]
+        slot = _deal_slots(number, block)
+        self._waiting = [collections.deque(np.flatnonzero(slot == k)) for k in range(block)]
         self.blocks = min(jax.device_count(), max(map(len, self._waiting)))
         self.trial = np.zeros(self.blocks * block, int)  # any trial where none is left
         self.active: dict[int, _ActiveTrial] = {}  # by slot
@@ -254,6 +254,20 @@ class _Slots:
                 over[running.trial] = outcome, running.walk(outcome, period)
                 del self.active[slot]
         return over
+
+
+def _deal_slots(number: Int[np.ndarray, " N"], block: int) -> Int[np.ndarray, " N"]:
+    """Deal out a block's slots by number, and by row where the rows of a table share their numbers.
+
+    All slots have as many trials, give or take one, and more trials per row change no slot.
+    """
+    rows = np.bincount(number).max()
+    seen = collections.Counter[int]()
+    place = []
+    for n in number.tolist():
+        place.append(n * rows + seen[n])
+        seen[n] += 1
+    return np.array(place) % block
 
 
 def _is_camera_in_phase(c: Config, clock: int) -> bool:

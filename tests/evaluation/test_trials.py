@@ -155,6 +155,17 @@ def test_where_one_has_come_to_its_end_the_next_begins():
     assert slots.fill().tolist() == [4] and slots.trial.tolist() == [0, 1, 2, 3, 7, 5]
 
 
+def test_rows_share_the_slots_evenly():
+    # three rows of two trials: the numbers 0, 1 are the places 0, 1, 2 and 3, 4, 5 of the rows
+    few = trials._deal_slots(np.tile(np.arange(2), 3), 4)
+    assert few.reshape(3, 2).tolist() == [[0, 3], [1, 0], [2, 1]]
+    many = trials._deal_slots(np.tile(np.arange(10), 12), 100).reshape(12, 10)
+    assert np.bincount(many.ravel(), minlength=100).tolist() == 20 * [2] + 80 * [1]
+    # more trials per row move none of them
+    more = trials._deal_slots(np.tile(np.arange(25), 12), 100).reshape(12, 25)
+    np.testing.assert_array_equal(more[:, :10], many)
+
+
 def test_a_trial_begins_when_frames_come_as_at_first():
     # 20 Hz at 50 Hz: the frames' pattern comes round every 5 steps
     c = config.override(C, {"network": {"variant": "full"}})
