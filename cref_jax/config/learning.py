@@ -68,7 +68,8 @@ class Distillation:
     teacher_iterations: int = 0  # in which PPO trains the teacher; 0: nine tenths of the run's
     learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
     teachers: tuple[str, ...] = ()
-    """KIND=POLICY: whom to imitate on lanes of this kind; on all others it is --init"""
+    """KIND=POLICY, or KIND:FIRST-LAST=POLICY for these levels: whom to imitate on lanes of this
+    kind; on all others it is --init"""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Teachers of a run by PPO: frozen policies, each imitated on lanes of its own kinds.
+"""Teachers of a run by PPO: frozen policies, each imitated on lanes of its own kinds and levels.
 
 The student acts, and each teacher says what it would do in the states that are visited on its lanes
 (DAgger, Ross et al. 2011); how far the student is from that is one more loss of PPO (kickstarting,
@@ -6,9 +6,11 @@ arXiv 1803.03835). Lanes that no other teacher has are the first one's: the poli
 begins as.
 """
 
+import re
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
@@ -27,40 +29,61 @@ class Teacher(NamedTuple):
     obs: ppo.RunningStatistics
 
 
-def split_names(c: config.Distillation) -> dict[str, str]:
-    """Read which kinds of lane have which teacher.
+class Lesson(NamedTuple):
+    """Lanes on which a policy is imitated."""
+
+    kind: str
+    levels: tuple[int, int] | None  # first and last; None: all
+    policy: str
+
+
+def read_lessons(c: config.Distillation) -> list[Lesson]:
+    """Read which lanes have which teacher.
 
     Raises:
-        ConfigError: an entry that is not KIND=POLICY, or a kind with two teachers.
+        ConfigError: an entry that is not KIND=POLICY or KIND:FIRST-LAST=POLICY.
     """
-    by_kind: dict[str, str] = {}
+    lessons = []
     for entry in c.teachers:
-        kind, equals, path = entry.partition("=")
-        if not (kind and equals and path):
-            raise ConfigError(f"--distillation.teachers: '{entry}' is not KIND=POLICY")
-        if kind in by_kind:
-            raise ConfigError(f"--distillation.teachers: two for '{kind}'; give one")
-        by_kind[kind] = path
-    return by_kind
+        found = re.fullmatch(r"([^=:]+)(?::(\d+)(?:-(\d+))?)?=(.+)", entry)
+        if not found:
+            raise ConfigError(
+                f"--distillation.teachers: '{entry}' is not KIND=POLICY or KIND:FIRST-LAST=POLICY"
+            )
+        kind, first, last, policy = found.groups()
+        levels = (int(first), int(last or first)) if first else None
+        lessons.append(Lesson(kind, levels, policy))
+    return lessons
 
 
 def list_teachers(c: config.Distillation) -> list[str]:
     """List the teachers besides the policy that the run begins as, each once."""
-    return list(dict.fromkeys(split_names(c).values()))
+    return list(dict.fromkeys(lesson.policy for lesson in read_lessons(c)))
 
 
-def number_kinds(c: config.Distillation, lanes: Atlas) -> Int[np.ndarray, " kinds"]:
-    """Number the teacher of each kind of lane; 0 is the policy that the run begins as.
+def number_lanes(c: config.Distillation, lanes: Atlas) -> Int[np.ndarray, "kinds levels"]:
+    """Number the teacher of each kind and level; 0 is the policy that the run begins as.
 
     Raises:
-        ConfigError: a kind that the terrain does not have.
+        ConfigError: a kind or a level that the terrain does not have, or a lane with two teachers.
     """
-    by_kind, names = split_names(c), list_teachers(c)
-    for kind in by_kind:
+    names = list_teachers(c)
+    numbers = np.zeros((len(lanes.kinds), lanes.levels), int)
+    for kind, levels, policy in read_lessons(c):
         if kind not in lanes.kinds:
             unknown = describe_unknown("kind of lane", kind, list(lanes.kinds))
             raise ConfigError(f"--distillation.teachers: {unknown}")
-    return np.array([names.index(by_kind[k]) + 1 if k in by_kind else 0 for k in lanes.kinds])
+        first, last = levels or (0, lanes.levels - 1)
+        if not first <= last < lanes.levels:
+            raise ConfigError(
+                f"--distillation.teachers: '{kind}:{first}-{last}' must be levels that rise, of 0 "
+                f"to {lanes.levels - 1}"
+            )
+        own = numbers[lanes.kinds.index(kind), first : last + 1]
+        if own.any():
+            raise ConfigError(f"--distillation.teachers: two for a level of '{kind}'; give one")
+        own[:] = names.index(policy) + 1
+    return numbers
 
 
 def ask_teachers(
@@ -69,25 +92,31 @@ def ask_teachers(
     teachers: tuple[Teacher, ...],
     memory: network.Carry,
     rollout: ppo.Rollout,
+    level: Int[Array, "T E"],
 ) -> tuple[network.Carry, Float[Array, "T E J"], Float[Array, "T E"]]:
-    """Compute what each robot's teacher would have done in a rollout.
+    """Compute what each robot's teacher would have done in a rollout on lanes of these levels.
 
     Returns the teachers' memory after it, their mean actions, and how far the policy's are from
     them (nats, at its deviations). The kinds of lane are dealt out by the robots' numbers, so that
-    each teacher sees the robots on its own lanes alone.
+    each teacher sees the robots on its own kinds alone. A robot comes to another level, and so to
+    another teacher, only where an episode begins, with an empty memory.
     """
     clean = ppo.zero_invalid(rollout)
     kinds = world.lanes.kind_of(np.arange(rollout.begins.shape[1]))
-    teacher_of = number_kinds(world.config.distillation, world.lanes)[kinds]
-    target = clean.mean
+    numbers = number_lanes(world.config.distillation, world.lanes)
+    before, target = memory, clean.mean
     for number, teacher in enumerate(teachers):
-        own = np.flatnonzero(teacher_of == number)
+        own = np.flatnonzero((numbers == number).any(axis=1)[kinds])
         if not own.size:
             continue
         obs = ppo.normalize(teacher.obs, clean.obs[:, own])
         sight = jax.tree.map(lambda x, own=own: x[:, own], clean.sight)
-        carry = jax.tree.map(lambda x, own=own: x[own], memory)
+        carry = jax.tree.map(lambda x, own=own: x[own], before)
         carry, said = actor.apply(teacher.actor, carry, obs, clean.begins[:, own], sight)
-        target = target.at[:, own].set(said.mean)
-        memory = jax.tree.map(lambda x, new, own=own: x.at[own].set(new), memory, carry)
+        asked = jnp.asarray(numbers)[kinds[own], level[:, own]][..., None] == number
+        keep = lambda old, new, own=own, asked=asked[-1]: old.at[own].set(
+            jnp.where(asked, new, old[own])
+        )
+        target = target.at[:, own].set(jnp.where(asked, said.mean, target[:, own]))
+        memory = jax.tree.map(keep, memory, carry)
     return memory, target, gaussian.kl_of_means(target, clean.mean, rollout.log_std[0, 0])

@@ -195,7 +195,8 @@ def _reinforce(
     taught = robots.memory.teacher
     robots, experience, trace = rollout.collect(world, nets, train, robots, keys.robots)
     if teachers:
-        asked = imitation.ask_teachers(world, nets.actor, teachers, taught, experience)
+        level = trace.measures.level
+        asked = imitation.ask_teachers(world, nets.actor, teachers, taught, experience, level)
         taught, target, teacher_kl = asked
         experience = experience._replace(target=target)
         trace = trace._replace(teacher_kl=teacher_kl)

@@ -328,3 +328,17 @@ def test_walls_are_looked_for_if_they_cost_something(world, step, robots):
     found = seen.measures.terms["wall_contact"]
     assert float(found[stairs]) <= -5.0 and float(found[stairs]) % -5.0 == 0.0
     assert (np.delete(found, stairs) == 0.0).all()
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(-0.001, True), (0.001, False)])
+def test_links_that_are_kept_clear_have_hit_the_ground_where_they_touch_it(
+    world, robots, gap, expected
+):
+    physics = world.physics
+    links, capsules = physics.links(one(robots).body), physics.robot.capsules
+    clear = np.tile(capsules.kept_clear, 2)
+    ends = np.concatenate([capsules.start, capsules.end])[clear]
+    body, radius = np.tile(capsules.body, 2)[clear], np.tile(capsules.radius, 2)[clear]
+    lowest = float((kinematics.points(links, body, ends)[:, 2] - radius).min())
+    ground = terrain.from_heights(np.full((200, 200), lowest - gap), 0.1, (-10.0, -10.0))
+    assert bool(physics.is_hit(ground, links)) == expected

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import small_world
 from tiny_policy import policy
 
 from cref_jax.errors import ConfigError
 from cref_jax.evaluation import highway_gate
+from cref_jax.evaluation.recorder import StepRecords
 
 
 def test_phases_by_the_feet_in_the_air():
@@ -40,6 +42,23 @@ def test_the_gate_of_a_state_worked_by_hand():
     assert (row.n, row.robots, row.note) == (4, 2, "n below 100")
     assert row.mean == pytest.approx(0.275)
     assert (row.q25, row.median, row.q75) == pytest.approx((0.175, 0.25, 0.35))
+
+
+def test_the_first_second_and_what_follows_an_end_do_not_count():
+    steps = 60  # of 20 ms; robot 0 walks on flat ground, and its first episode ends after step 56
+    gate = np.zeros((steps, 1, 3))
+    gate[..., 1:] = 9.0  # the percentiles
+    gate[50:55, 0, 0], gate[55:57, 0, 0], gate[57:, 0, 0] = 0.2, 0.9, 7.0
+    airborne = np.zeros((steps, 1, 2), bool)
+    airborne[55:, 0, 0] = True
+    pose = np.tile([0.5, 0.0, 0.6, 1.0, 0.0, 0.0, 0.0], (steps, 1, 1))
+    watched = StepRecords(np.arange(steps)[:, None] < 57, highway_gate.Step(gate, airborne, pose))
+    rows = {row.state: row for row in highway_gate.make_rows(small_world.world(), watched)}
+    assert (rows["flat"].n, rows["flat"].robots) == (7, 1)
+    assert rows["flat"].mean == pytest.approx((5 * 0.2 + 2 * 0.9) / 7)
+    assert rows["double support"].n == 5 and rows["double support"].mean == pytest.approx(0.2)
+    assert rows["single support"].n == 2 and rows["single support"].mean == pytest.approx(0.9)
+    assert rows["stable"].n == 7 and rows["risky"].n == rows["gap"].n == 0
 
 
 @pytest.mark.parametrize("variant", ["no_highway", "hpl"])

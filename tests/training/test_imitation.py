@@ -34,27 +34,35 @@ def of(*teachers: str) -> config.Distillation:
     return config.Distillation(teachers=teachers)
 
 
-def test_kinds_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
-    assert world.lanes.kinds[:3] == ("flat", "rough", "slope")
-    named = of("slope=b", "flat=a", "gap=b")
+def test_lanes_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
+    assert world.lanes.kinds[:3] == ("flat", "rough", "slope") and world.lanes.levels == 3
+    named = of("slope=b", "flat:2=a", "gap:0-1=b")
     assert imitation.list_teachers(named) == ["b", "a"]
-    by_kind = dict(zip(world.lanes.kinds, imitation.number_kinds(named, world.lanes), strict=True))
-    assert (by_kind.pop("slope"), by_kind.pop("gap"), by_kind.pop("flat")) == (1, 1, 2)
-    assert set(by_kind.values()) == {0}
+    numbers = imitation.number_lanes(named, world.lanes).tolist()
+    by_kind = dict(zip(world.lanes.kinds, numbers, strict=True))
+    assert by_kind.pop("slope") == [1, 1, 1]
+    assert by_kind.pop("gap") == [1, 1, 0]
+    assert by_kind.pop("flat") == [0, 0, 2]
+    assert all(of_kind == [0, 0, 0] for of_kind in by_kind.values())
 
 
 @pytest.mark.parametrize(
     ("teachers", "says"),
     [
-        (("flat",), "'flat' is not KIND=POLICY"),
+        (("flat",), "'flat' is not KIND=POLICY or KIND:FIRST-LAST=POLICY"),
         (("=a",), "'=a' is not KIND=POLICY"),
-        (("flat=a", "flat=b"), "two for 'flat'; give one"),
+        (("flat:=a",), "'flat:=a' is not KIND=POLICY"),
+        (("flat:high=a",), "'flat:high=a' is not KIND=POLICY"),
+        (("flat=a", "flat=b"), "two for a level of 'flat'; give one"),
+        (("flat:0-1=a", "flat:1-2=b"), "two for a level of 'flat'; give one"),
+        (("flat:1-3=a",), "'flat:1-3' must be levels that rise, of 0 to 2"),
+        (("flat:2-1=a",), "'flat:2-1' must be levels that rise, of 0 to 2"),
         (("stair_up=a",), "unknown kind of lane 'stair_up'; did you mean 'stairs_up'?"),
     ],
 )
 def test_a_wrong_teacher_is_named(world, teachers, says):
     with pytest.raises(ConfigError, match=says):
-        imitation.number_kinds(of(*teachers), world.lanes)
+        imitation.number_lanes(of(*teachers), world.lanes)
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +91,8 @@ def test_each_teacher_says_what_it_would_do_on_its_own_lanes_and_remembers(taugh
     collect = jax.jit(lambda robots, keys: rollout.collect(world, nets, state.train, robots, keys))
     ask = jax.jit(lambda *a: imitation.ask_teachers(world, nets.actor, state.teachers, *a))
     for seed in (1, 2):
-        robots, seen, _ = collect(robots, jax.random.split(jax.random.key(seed), E))
-        memory, target, apart = ask(memory, seen)
+        robots, seen, trace = collect(robots, jax.random.split(jax.random.key(seed), E))
+        memory, target, apart = ask(memory, seen, trace.measures.level)
         for number, teacher in enumerate(state.teachers):
             obs = ppo.normalize(teacher.obs, seen.obs)
             alone[number], said = nets.actor.apply(
@@ -99,15 +107,37 @@ def test_each_teacher_says_what_it_would_do_on_its_own_lanes_and_remembers(taugh
         np.testing.assert_allclose(apart, 0.5 * np.square(shift).sum(axis=-1), rtol=1e-4)
 
 
+@pytest.mark.parametrize("levels", [(0, 1), (1, 0)])
+def test_a_new_episode_on_another_level_has_that_levels_teacher(taught, levels):
+    world, state = taught
+    world = world.replace(config=settings("slope:1=other"))
+    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
+    keys = jax.random.split(jax.random.key(1), E)
+    _, seen, _ = jax.jit(lambda r: rollout.collect(world, nets, state.train, r, keys))(state.robots)
+    seen = seen._replace(begins=seen.begins.at[:].set(False).at[2].set(True))
+    level = jnp.repeat(jnp.array(levels), 2)[:, None] * jnp.ones((T, E), int)
+    begun = jax.tree.map(lambda x: x + 0.5, state.robots.memory.teacher)
+    memory, target, _ = imitation.ask_teachers(
+        world, nets.actor, state.teachers, begun, seen, level
+    )
+    slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
+    for steps, number in zip((slice(0, 2), slice(2, 4)), levels, strict=True):
+        teacher = state.teachers[number]
+        obs = ppo.normalize(teacher.obs, seen.obs)
+        carry, said = nets.actor.apply(teacher.actor, begun, obs, seen.begins, seen.sight)
+        np.testing.assert_allclose(target[steps, slopes], said.mean[steps, slopes], atol=1e-5)
+    np.testing.assert_allclose(memory.gru[slopes], carry.gru[slopes], atol=1e-5)
+
+
 def test_who_learns_from_itself_is_where_it_should_be(taught):
     world, state = taught
     own = Teacher(state.train.params.actor, state.train.statistics.obs)
     nets = rollout.networks(SMALL, world.physics.robot.num_joints)
     keys = jax.random.split(jax.random.key(1), E)
     collect = jax.jit(lambda robots: rollout.collect(world, nets, state.train, robots, keys))
-    _, seen, _ = collect(state.robots)
+    _, seen, trace = collect(state.robots)
     *_, apart = imitation.ask_teachers(
-        world, nets.actor, (own, own), state.robots.memory.teacher, seen
+        world, nets.actor, (own, own), state.robots.memory.teacher, seen, trace.measures.level
     )
     assert float(jnp.abs(apart).max()) < 1e-6
 

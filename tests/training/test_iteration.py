@@ -12,6 +12,8 @@ import small_world
 from tiny_policy import SMALL
 
 from cref_jax import config
+from cref_jax.env import environment
+from cref_jax.env.state import Ending
 from cref_jax.training import iteration, rollout
 
 
@@ -33,6 +35,46 @@ def test_the_samples_of_a_teacher_of_billions_are_counted():
     found = log(jnp.int32(19_000))  # of 20,000 iterations 18,000 are the teacher's
     assert float(found["train/teacher_samples"]) == pytest.approx(18_000 * 8192 * 24)
     assert float(found["train/student_samples"]) == pytest.approx(1000 * 8192 * 24, rel=1e-5)
+
+
+def test_the_log_of_three_robots_over_two_steps_worked_by_hand():
+    no = np.zeros((2, 3), bool)
+    tilted, finished = no.copy(), no.copy()
+    tilted[0, 0], finished[1, 1] = True, True  # robot 2 walks on
+    ending = Ending(
+        tilted=tilted, low=no, hit=no, dropped=no, unstable=no, stalled=no, finished=finished,
+        timeout=no,
+    )  # fmt: skip
+    touchdown = np.zeros((2, 3, 2), bool)
+    touchdown[0, 0], touchdown[1, 1, 0] = True, True
+    distance = np.full((2, 3, 2), 0.5)
+    distance[0, 0] = 0.1, np.inf
+    distance[1, 1] = 0.3
+    measures = environment.Measures(
+        terms={}, speed_error=no + 0.2, forward_speed=no + 0.4, forward_command=no + 0.6,
+        airborne=touchdown, touchdown=touchdown, foothold_distance=distance, progress=no + 1.0,
+        commanded=no + 1.0, steps=np.array([[50, 99, 7], [1, 100, 8]]),
+        kind=np.tile([0, 1, 1], (2, 1)), level=no + 0, rank=np.array([[4, 5, 8], [3, 6, 8]]),
+    )  # fmt: skip
+    trace = rollout.Trace(no + 1.0, ending, measures, np.tile([1.0, 2.0, 4.0], (2, 1)))
+    log = iteration._episode_log(jax.tree.map(jnp.asarray, trace), ("flat", "gap", "slope"), 0.02)
+    expected = {
+        "episode/length_s": 1.5,  # of 50 and of 100 steps
+        "episode/ended": 2.0,
+        "episode/fell": 1.0,
+        "episode/falls_per_minute": 60.0 / (6 * 0.02),  # one in six steps
+        "foothold/distance": 0.2,  # of 0.1 and 0.3 m
+        "foothold/empty": 1 / 3,
+        "walk/airborne": 3 / 12,
+        "teacher_kl/mean": 7 / 3,
+        "level/flat": 3.5,
+        "level/gap": 6.75,
+        "level/slope": 0.0,  # nobody is there
+        "fell/flat": 1.0,
+        "fell/gap": 0.0,
+        "teacher_kl/gap": 3.0,
+    }
+    assert {k: float(log[k]) for k in expected} == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("ramp", [True, False])
