@@ -2,8 +2,8 @@
 
 Each device steps a block of robots, and where a trial ends the next one starts. A trial's slot in a
 block follows from its number and its row in the table, so its outcome depends only on the seed, its
-number, its row and its lane, not on the number of trials or of devices. (Another block size, as on another
-device, rounds matrix products differently.)
+number, its row and its lane, not on the number of trials or of devices. (Another block size, as on
+another device, rounds matrix products differently.)
 """
 
 import collections
