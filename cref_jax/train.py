@@ -183,7 +183,7 @@ def train(options: Options, c: Config) -> None:
     threads = max(parallel.cores() // len(mesh.local_devices), 1)
     # what is wrong with the terrain is said before anything is written
     world = processes.replicate(build_world(c, options.engine, threads), mesh)
-    imitation.number_lanes(c.distillation, world.lanes)
+    imitation.number_lanes(c, world.lanes)
     name = run_dir.reserve if processes.is_first() else run_dir.ROOT.joinpath
     run = options.run_dir or name(_name(options))
     options = dataclasses.replace(options, run_dir=run)

@@ -105,6 +105,7 @@ RANGES: Ranges = {
         "depth_holes": Within(0, 0.5),
         "narrow_view": Within(0, 1),
         "push_yaw_rate": Within(0, 100),
+        "undisturbed": Within(0, 1),
         "ramp_falls": Rising(0, 1e6),
         "ramp_step": Within(0, 1),
     },

@@ -20,6 +20,10 @@ from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.ppo import gaussian
 from cref_jax.terrain.atlas import Atlas
+from cref_jax.training import randomization_ramp
+
+UNDISTURBED = "undisturbed"  # in place of a kind: robots for which nothing is randomised
+_NOBODY = -1
 
 
 class Teacher(NamedTuple):
@@ -32,7 +36,7 @@ class Teacher(NamedTuple):
 class Lesson(NamedTuple):
     """Lanes on which a policy is imitated."""
 
-    kind: str
+    kind: str  # or UNDISTURBED
     levels: tuple[int, int] | None  # first and last; None: all
     policy: str
 
@@ -61,29 +65,53 @@ def list_teachers(c: config.Distillation) -> list[str]:
     return list(dict.fromkeys(lesson.policy for lesson in read_lessons(c)))
 
 
-def number_lanes(c: config.Distillation, lanes: Atlas) -> Int[np.ndarray, "kinds levels"]:
-    """Number the teacher of each kind and level; 0 is the policy that the run begins as.
+def number_lanes(c: config.Config, lanes: Atlas) -> Int[np.ndarray, "2 kinds levels"]:
+    """Number the teacher of each kind and level, for robots disturbed [0] and undisturbed [1].
+
+    0 is the policy that the run begins as.
 
     Raises:
-        ConfigError: a kind or a level that the terrain does not have, or a lane with two teachers.
+        ConfigError: a kind or a level that the terrain does not have, a lane with two teachers, or
+            one for robots that do not exist.
     """
-    names = list_teachers(c)
-    numbers = np.zeros((len(lanes.kinds), lanes.levels), int)
-    for kind, levels, policy in read_lessons(c):
-        if kind not in lanes.kinds:
-            unknown = describe_unknown("kind of lane", kind, list(lanes.kinds))
-            raise ConfigError(f"--distillation.teachers: {unknown}")
+    names = list_teachers(c.distillation)
+    numbers = np.full((2, len(lanes.kinds), lanes.levels), _NOBODY)
+    for kind, levels, policy in read_lessons(c.distillation):
         first, last = levels or (0, lanes.levels - 1)
         if not first <= last < lanes.levels:
             raise ConfigError(
                 f"--distillation.teachers: '{kind}:{first}-{last}' must be levels that rise, of 0 "
                 f"to {lanes.levels - 1}"
             )
-        own = numbers[lanes.kinds.index(kind), first : last + 1]
-        if own.any():
+        own = _find_kind(c, lanes, numbers, kind)[..., first : last + 1]
+        if (own != _NOBODY).any():
             raise ConfigError(f"--distillation.teachers: two for a level of '{kind}'; give one")
         own[:] = names.index(policy) + 1
-    return numbers
+    disturbed = np.where(numbers[0] == _NOBODY, 0, numbers[0])
+    return np.stack([disturbed, np.where(numbers[1] == _NOBODY, disturbed, numbers[1])])
+
+
+def _find_kind(
+    c: config.Config, lanes: Atlas, numbers: Int[np.ndarray, "2 kinds levels"], kind: str
+) -> Int[np.ndarray, "*kinds levels"]:
+    """Find the part of the numbers that an entry of this kind is about."""
+    if kind == UNDISTURBED:
+        if not c.randomisation.undisturbed:
+            raise ConfigError(
+                f"--distillation.teachers: '{kind}' needs --randomisation.undisturbed above 0"
+            )
+        return numbers[1]
+    if kind not in lanes.kinds:
+        unknown = describe_unknown("kind of lane", kind, [*lanes.kinds, UNDISTURBED])
+        raise ConfigError(f"--distillation.teachers: {unknown}")
+    return numbers[0, lanes.kinds.index(kind)]
+
+
+def number_robots(c: config.Config, lanes: Atlas, num_envs: int) -> Int[np.ndarray, "E levels"]:
+    """Number the teacher of each robot of a device on each level."""
+    robots = np.arange(num_envs)
+    undisturbed = randomization_ramp.deal_undisturbed(c.randomisation, lanes, num_envs)
+    return number_lanes(c, lanes)[undisturbed.astype(int), lanes.kind_of(robots)]
 
 
 def ask_teachers(
@@ -102,18 +130,17 @@ def ask_teachers(
     another teacher, only where an episode begins, with an empty memory.
     """
     clean = ppo.zero_invalid(rollout)
-    kinds = world.lanes.kind_of(np.arange(rollout.begins.shape[1]))
-    numbers = number_lanes(world.config.distillation, world.lanes)
+    numbers = number_robots(world.config, world.lanes, rollout.begins.shape[1])
     before, target = memory, clean.mean
     for number, teacher in enumerate(teachers):
-        own = np.flatnonzero((numbers == number).any(axis=1)[kinds])
+        own = np.flatnonzero((numbers == number).any(axis=1))
         if not own.size:
             continue
         obs = ppo.normalize(teacher.obs, clean.obs[:, own])
         sight = jax.tree.map(lambda x, own=own: x[:, own], clean.sight)
         carry = jax.tree.map(lambda x, own=own: x[own], before)
         carry, said = actor.apply(teacher.actor, carry, obs, clean.begins[:, own], sight)
-        asked = jnp.asarray(numbers)[kinds[own], level[:, own]][..., None] == number
+        asked = jnp.asarray(numbers)[own, level[:, own]][..., None] == number
         keep = lambda old, new, own=own, asked=asked[-1]: old.at[own].set(
             jnp.where(asked, new, old[own])
         )

@@ -145,7 +145,7 @@ def _iteration(world: World, state: RunState, mesh: Mesh, key: Array) -> tuple[R
     def learn(
         world: World, state: RunState, key: Array
     ) -> tuple[RunState, Losses | distillation.Losses, rollout.Trace]:
-        robots = rollout.with_randomization(state.robots, state.ramp.share)
+        robots = rollout.with_randomization(world, state.robots, state.ramp.share)
         teach = functools.partial(_reinforce, teachers=state.teachers)
         teach = distillation.learn if c.network.variant == "hpl" else teach
         key_robots, key_update = jax.random.split(key)

@@ -8,9 +8,11 @@ from typing import no_type_check
 
 import flax.struct
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from cref_jax import config
+from cref_jax.terrain.atlas import Atlas
 
 _MEMORY = 0.9  # weight of earlier falls in the running mean, per iteration; assumed
 
@@ -28,6 +30,14 @@ def initial_ramp(c: config.Randomisation) -> Ramp:
     """Create the initial ramp: no randomisation, or all of it if the ramp is disabled."""
     low, high = c.ramp_falls
     return Ramp(jnp.float32(0.0 if c.ramp else 1.0), jnp.float32(0.5 * (low + high)))
+
+
+def deal_undisturbed(
+    c: config.Randomisation, lanes: Atlas, num_envs: int
+) -> Bool[np.ndarray, " E"]:
+    """Deal out which robots of a device have nothing randomised, the same share on each lane."""
+    turn = np.arange(num_envs) // len(lanes.turns)
+    return np.floor((turn + 1) * c.undisturbed) > np.floor(turn * c.undisturbed)
 
 
 def update_ramp(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:

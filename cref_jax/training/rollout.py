@@ -17,7 +17,7 @@ from cref_jax import config, depth, network, ppo
 from cref_jax.env import environment, resets
 from cref_jax.env.environment import Outcome
 from cref_jax.env.observations import Observation
-from cref_jax.env.state import Ending, EnvState, even_spread
+from cref_jax.env.state import Ending, EnvState, Spread, even_spread
 from cref_jax.env.world import World
 from cref_jax.ppo import auxiliary
 from cref_jax.training import camera_feed, randomization_ramp
@@ -139,8 +139,10 @@ def start(world: World, keys: Key[Array, " E"]) -> Robots:
     draw = lambda of, end: jax.vmap(lambda key: jax.random.randint(key, (), 0, end))(each[:, of])
     kinds = jnp.asarray(world.lanes.kind_of(np.arange(keys.shape[0])))
     levels = draw(0, min(c.curriculum.start_level, world.lanes.levels - 1) + 1)
-    spread = even_spread(randomization_ramp.initial_ramp(c.randomisation).share)
-    reset = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, None))
+    spread = _spread_by_robot(
+        world, randomization_ramp.initial_ramp(c.randomisation).share, keys.size
+    )
+    reset = jax.vmap(resets.reset, in_axes=(None, 0, 0, 0, 0))
     state = reset(world, each[:, 1], kinds, levels, spread)
     state = state.replace(step=draw(2, round(c.episode.length / c.physics.control_period)))
     return init_robots(world, state, each[:, 3])
@@ -163,10 +165,16 @@ def init_robots(world: World, state: EnvState, keys: Key[Array, " E"]) -> Robots
     )
 
 
-def with_randomization(robots: Robots, share: Float[Array, ""]) -> Robots:
+def with_randomization(world: World, robots: Robots, share: Float[Array, ""]) -> Robots:
     """Set the share of the randomisation ranges that later draws use."""
-    spread = even_spread(jnp.broadcast_to(share, robots.begins.shape))
+    spread = _spread_by_robot(world, share, robots.begins.size)
     return robots.replace(env=robots.env.replace(spread=spread))
+
+
+def _spread_by_robot(world: World, share: Float[Array, ""], num_envs: int) -> Spread:
+    c = world.config.randomisation
+    undisturbed = randomization_ramp.deal_undisturbed(c, world.lanes, num_envs)
+    return even_spread(jnp.where(undisturbed, 0.0, share))
 
 
 def with_twins(robots: Robots) -> Robots:

@@ -14,7 +14,7 @@ from tiny_policy import SMALL
 from cref_jax import config, ppo
 from cref_jax.errors import ConfigError
 from cref_jax.policy import sources, warm_start
-from cref_jax.training import imitation, iteration, resumption, rollout
+from cref_jax.training import imitation, iteration, randomization_ramp, resumption, rollout
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.imitation import Teacher
 
@@ -30,15 +30,18 @@ def settings(*teachers: str, **ppo_settings: float) -> config.Config:
     return dataclasses.replace(config.override(small_world.C, changes), network=SMALL)
 
 
-def of(*teachers: str) -> config.Distillation:
-    return config.Distillation(teachers=teachers)
+def of(*teachers: str, undisturbed: float = 0.0) -> config.Config:
+    randomisation = {"randomisation": {"undisturbed": undisturbed}}
+    return config.override(settings(*teachers), randomisation)
 
 
 def test_lanes_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
     assert world.lanes.kinds[:3] == ("flat", "rough", "slope") and world.lanes.levels == 3
     named = of("slope=b", "flat:2=a", "gap:0-1=b")
-    assert imitation.list_teachers(named) == ["b", "a"]
-    numbers = imitation.number_lanes(named, world.lanes).tolist()
+    assert imitation.list_teachers(named.distillation) == ["b", "a"]
+    disturbed, undisturbed = imitation.number_lanes(named, world.lanes)
+    assert np.array_equal(disturbed, undisturbed)
+    numbers = disturbed.tolist()
     by_kind = dict(zip(world.lanes.kinds, numbers, strict=True))
     assert by_kind.pop("slope") == [1, 1, 1]
     assert by_kind.pop("gap") == [1, 1, 0]
@@ -46,9 +49,24 @@ def test_lanes_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
     assert all(of_kind == [0, 0, 0] for of_kind in by_kind.values())
 
 
+def test_robots_with_nothing_randomised_have_a_teacher_of_their_own(world):
+    c = of("undisturbed:1-2=a", "slope=b", undisturbed=0.5)
+    disturbed, undisturbed = imitation.number_lanes(c, world.lanes)
+    slope, flat = (world.lanes.kinds.index(kind) for kind in ("slope", "flat"))
+    assert disturbed[slope].tolist() == [2, 2, 2] and disturbed[flat].tolist() == [0, 0, 0]
+    assert undisturbed[slope].tolist() == [2, 1, 1] and undisturbed[flat].tolist() == [0, 1, 1]
+    numbers = imitation.number_robots(c, world.lanes, E)
+    chosen = randomization_ramp.deal_undisturbed(c.randomisation, world.lanes, E)
+    assert 0 < chosen.sum() < E
+    for robot, apart in enumerate(chosen):
+        kind = world.lanes.kind_of(np.array([robot]))[0]
+        assert numbers[robot].tolist() == (undisturbed if apart else disturbed)[kind].tolist()
+
+
 @pytest.mark.parametrize(
     ("teachers", "says"),
     [
+        (("undisturbed=a",), "'undisturbed' needs --randomisation.undisturbed above 0"),
         (("flat",), "'flat' is not KIND=POLICY or KIND:FIRST-LAST=POLICY"),
         (("=a",), "'=a' is not KIND=POLICY"),
         (("flat:=a",), "'flat:=a' is not KIND=POLICY"),

@@ -14,7 +14,7 @@ from tiny_policy import SMALL
 from cref_jax import config
 from cref_jax.env import environment
 from cref_jax.env.state import Ending
-from cref_jax.training import iteration, rollout
+from cref_jax.training import iteration, randomization_ramp, rollout
 
 
 def test_a_deviation_below_the_least_is_raised_to_it():
@@ -87,6 +87,21 @@ def test_the_first_episodes_are_randomised_as_much_as_the_ramp_says(ramp):
     assert bool((robots.env.joint_offset == 0.0).all()) == ramp
     np.testing.assert_array_equal(robots.env.spread.mass, np.full(28, 0.0 if ramp else 1.0))
     assert math.isfinite(float(robots.env.body.qpos.sum()))
+
+
+def test_undisturbed_robots_stay_so_while_the_others_meet_everything():
+    changes = {"randomisation": {"enabled": True, "undisturbed": 0.5}}
+    world = small_world.world()
+    c = config.override(small_world.C, changes)
+    world = world.replace(config=c)
+    undisturbed = randomization_ramp.deal_undisturbed(c.randomisation, world.lanes, 28)
+    assert 0 < undisturbed.sum() < 28
+    keys = jax.random.split(jax.random.key(0), 28)
+    robots = jax.jit(rollout.start)(world, keys)
+    np.testing.assert_array_equal(robots.env.dynamics.payload == 0.0, undisturbed)
+    np.testing.assert_array_equal(robots.env.spread.mass, np.where(undisturbed, 0.0, 1.0))
+    later = rollout.with_randomization(world, robots, jnp.float32(0.25))
+    np.testing.assert_array_equal(later.env.spread.pushes, np.where(undisturbed, 0.0, 0.25))
 
 
 @pytest.mark.parametrize("enabled", [True, False])

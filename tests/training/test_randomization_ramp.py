@@ -4,6 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import pytest
+import small_world
 
 from cref_jax import config
 from cref_jax.training import randomization_ramp
@@ -54,3 +55,12 @@ def test_many_falls_lower_it_and_in_between_it_stays():
     assert float(after(9.0, 30, high).share) < share
     calm = after(3.0, 60, after(9.0, 10, high))
     assert float(after(3.0, 50, calm).share) == float(calm.share)
+
+
+@pytest.mark.parametrize(("share", "of_five"), [(0.0, 0), (0.4, 2), (0.5, 2), (1.0, 5)])
+def test_the_same_number_of_robots_on_each_lane_is_undisturbed(share: float, of_five: int):
+    lanes = small_world.world().lanes
+    turns = len(lanes.turns)
+    c = dataclasses.replace(C, undisturbed=share)
+    chosen = randomization_ramp.deal_undisturbed(c, lanes, 5 * turns)
+    assert [int(chosen[first::turns].sum()) for first in range(turns)] == turns * [of_five]
