@@ -69,8 +69,8 @@ class Distillation:
     learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
     teachers: tuple[str, ...] = ()
     """KIND=POLICY, or KIND:FIRST-LAST=POLICY for these levels: whom to imitate on lanes of this
-    kind; on all others it is --init. undisturbed=POLICY: whom robots imitate on all kinds for which
-    nothing is randomised"""
+    kind; on all others it is --init. undisturbed=POLICY: on all kinds, with nothing randomised.
+    KIND=none: PPO alone"""
 
 
 @dataclass(frozen=True)

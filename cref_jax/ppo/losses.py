@@ -32,8 +32,10 @@ def loss(
         askew = asymmetry_error(params.actor, batch, policy.mean, networks.actor, networks.mirror)
     apart = jnp.zeros_like(value)
     if batch.target is not None:
-        fixed = jax.lax.stop_gradient(policy.log_std)  # to explore more is not to imitate better
-        apart = gaussian.kl_of_means(batch.target, policy.mean, fixed)
+        own, fixed = jax.lax.stop_gradient((policy.mean, policy.log_std))
+        # who has no teacher is where it should be; to explore more is not to imitate better
+        target = jnp.where(jnp.isnan(batch.target), own, batch.target)
+        apart = gaussian.kl_of_means(target, policy.mean, fixed)
     parts = Losses(
         surrogate=mean(surrogate_loss(ratio, batch.advantage, c.clip)),
         value=mean(value_error(value, batch.value, batch.returns, c.value_clip)),

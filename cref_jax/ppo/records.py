@@ -69,7 +69,7 @@ class Batch(NamedTuple):
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None
     twin: PyTree[Float[Array, "E ?H"]] = None
     twin_obs: Float[Array, "T E O"] | None = None  # mirrored observations
-    target: Float[Array, "T E J"] | None = None  # the teachers' mean action, if there are any
+    target: Float[Array, "T E J"] | None = None  # the teachers' mean action; NaN: there is none
 
 
 class Losses(NamedTuple):
@@ -129,4 +129,4 @@ class Rollout(NamedTuple):
     sight: PyTree[Shaped[Array, "?K E *?n"]] = None  # further inputs of the actor, unnormalised
     twin: PyTree[Float[Array, "E ?H"]] = None  # memory of the mirrored actor before the first step
     guide: PyTree[Shaped[Array, "T E *?n"]] = None  # what a teacher sees besides, unnormalised
-    target: Float[Array, "T E J"] | None = None  # the teachers' mean action, if there are any
+    target: Float[Array, "T E J"] | None = None  # the teachers' mean action; NaN: there is none

@@ -23,7 +23,8 @@ from cref_jax.terrain.atlas import Atlas
 from cref_jax.training import randomization_ramp
 
 UNDISTURBED = "undisturbed"  # in place of a kind: robots for which nothing is randomised
-_NOBODY = -1
+NOBODY = "none"  # in place of a policy: these robots learn by PPO alone
+_UNSAID, _ALONE = -1, -2  # in place of a teacher's number
 
 
 class Teacher(NamedTuple):
@@ -38,7 +39,7 @@ class Lesson(NamedTuple):
 
     kind: str  # or UNDISTURBED
     levels: tuple[int, int] | None  # first and last; None: all
-    policy: str
+    policy: str  # or NOBODY
 
 
 def read_lessons(c: config.Distillation) -> list[Lesson]:
@@ -62,20 +63,21 @@ def read_lessons(c: config.Distillation) -> list[Lesson]:
 
 def list_teachers(c: config.Distillation) -> list[str]:
     """List the teachers besides the policy that the run begins as, each once."""
-    return list(dict.fromkeys(lesson.policy for lesson in read_lessons(c)))
+    named = dict.fromkeys(lesson.policy for lesson in read_lessons(c))
+    return [name for name in named if name != NOBODY]
 
 
 def number_lanes(c: config.Config, lanes: Atlas) -> Int[np.ndarray, "2 kinds levels"]:
     """Number the teacher of each kind and level, for robots disturbed [0] and undisturbed [1].
 
-    0 is the policy that the run begins as.
+    0 is the policy that the run begins as; below it, there is none.
 
     Raises:
         ConfigError: a kind or a level that the terrain does not have, a lane with two teachers, or
             one for robots that do not exist.
     """
     names = list_teachers(c.distillation)
-    numbers = np.full((2, len(lanes.kinds), lanes.levels), _NOBODY)
+    numbers = np.full((2, len(lanes.kinds), lanes.levels), _UNSAID)
     for kind, levels, policy in read_lessons(c.distillation):
         first, last = levels or (0, lanes.levels - 1)
         if not first <= last < lanes.levels:
@@ -84,11 +86,11 @@ def number_lanes(c: config.Config, lanes: Atlas) -> Int[np.ndarray, "2 kinds lev
                 f"to {lanes.levels - 1}"
             )
         own = _find_kind(c, lanes, numbers, kind)[..., first : last + 1]
-        if (own != _NOBODY).any():
+        if (own != _UNSAID).any():
             raise ConfigError(f"--distillation.teachers: two for a level of '{kind}'; give one")
-        own[:] = names.index(policy) + 1
-    disturbed = np.where(numbers[0] == _NOBODY, 0, numbers[0])
-    return np.stack([disturbed, np.where(numbers[1] == _NOBODY, disturbed, numbers[1])])
+        own[:] = _ALONE if policy == NOBODY else names.index(policy) + 1
+    disturbed = np.where(numbers[0] == _UNSAID, 0, numbers[0])
+    return np.stack([disturbed, np.where(numbers[1] == _UNSAID, disturbed, numbers[1])])
 
 
 def _find_kind(
@@ -125,13 +127,14 @@ def ask_teachers(
     """Compute what each robot's teacher would have done in a rollout on lanes of these levels.
 
     Returns the teachers' memory after it, their mean actions, and how far the policy's are from
-    them (nats, at its deviations). The kinds of lane are dealt out by the robots' numbers, so that
-    each teacher sees the robots on its own kinds alone. A robot comes to another level, and so to
-    another teacher, only where an episode begins, with an empty memory.
+    them (nats, at its deviations), both NaN where nobody teaches. The kinds of
+    lane are dealt out by the robots' numbers, so that each teacher sees the robots on its own kinds
+    alone. A robot comes to another level, and so to another teacher, only where an episode begins,
+    with an empty memory.
     """
     clean = ppo.zero_invalid(rollout)
     numbers = number_robots(world.config, world.lanes, rollout.begins.shape[1])
-    before, target = memory, clean.mean
+    before, target = memory, jnp.full_like(clean.mean, jnp.nan)
     for number, teacher in enumerate(teachers):
         own = np.flatnonzero((numbers == number).any(axis=1))
         if not own.size:

@@ -250,7 +250,7 @@ def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) ->
     """
     ending, measures = trace.ending, trace.measures
     over = ending.terminated | ending.truncated
-    masked_mean = lambda x, which: jnp.sum(x * which) / jnp.maximum(which.sum(), 1)
+    masked_mean = lambda x, which: jnp.where(which, x, 0.0).sum() / jnp.maximum(which.sum(), 1)
     distance = measures.foothold_distance
     placed = measures.touchdown & jnp.isfinite(distance)
     log = {
@@ -263,15 +263,16 @@ def _episode_log(trace: rollout.Trace, kinds: tuple[str, ...], period: float) ->
         "walk/forward_speed": measures.forward_speed.mean(),
         "walk/airborne": measures.airborne.mean(),
         "walk/reward": trace.reward.mean(),
-        "foothold/distance": masked_mean(jnp.where(placed, distance, 0.0), placed),
+        "foothold/distance": masked_mean(distance, placed),
         "foothold/empty": masked_mean(~jnp.isfinite(distance), measures.touchdown),
     }
     if trace.teacher_kl is not None:
-        log["teacher_kl/mean"] = trace.teacher_kl.mean()
+        taught = ~jnp.isnan(trace.teacher_kl)
+        log["teacher_kl/mean"] = masked_mean(trace.teacher_kl, taught)
     for number, kind in enumerate(kinds):
         here = measures.kind == number
         log[f"level/{kind}"] = masked_mean(measures.rank, here)
         log[f"fell/{kind}"] = masked_mean(ending.terminated, here & over)
         if trace.teacher_kl is not None:
-            log[f"teacher_kl/{kind}"] = masked_mean(trace.teacher_kl, here)
+            log[f"teacher_kl/{kind}"] = masked_mean(trace.teacher_kl, here & taught)
     return log

@@ -294,6 +294,23 @@ def test_a_teacher_two_deviations_away_costs_two_nats_whatever_the_deviation_doe
     np.testing.assert_allclose(with_it - without, 3.0 * 2.0, rtol=1e-4)
 
 
+def test_who_has_no_teacher_is_not_drawn_anywhere():
+    # half of the samples have a teacher 2 s beside them, as above, and the mean is half as much
+    networks, params = mirrored_toy()
+    networks = networks._replace(mirror=None)
+    batch = judge(some_rollout())
+    _, said = networks.actor(params.actor, (), batch.obs, None, None)
+    alone = (jnp.arange(E) % 2 == 0)[:, None]
+    beside = said.mean + jnp.array([0.0, 2.0])
+    c = dataclasses.replace(C, imitation_weight=3.0)
+    batch = batch._replace(target=jnp.where(alone, jnp.nan, beside))
+    _, parts = losses.loss(params, batch, c, networks)
+    np.testing.assert_allclose(parts.teacher_kl, 1.0, rtol=1e-5)
+    batch = batch._replace(target=jnp.full_like(beside, jnp.nan))
+    pull = jax.grad(lambda p, c: losses.loss(p, batch, c, networks)[0])
+    jax.tree.map(np.testing.assert_array_equal, pull(params, c), pull(params, C))
+
+
 def test_the_readout_is_judged_by_the_last_of_what_the_critic_sees():
     batch = judge(some_rollout())
     params = initial_params()

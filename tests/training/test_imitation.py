@@ -63,6 +63,28 @@ def test_robots_with_nothing_randomised_have_a_teacher_of_their_own(world):
         assert numbers[robot].tolist() == (undisturbed if apart else disturbed)[kind].tolist()
 
 
+def test_lanes_can_have_no_teacher(taught):
+    world, state = taught
+    world = world.replace(config=settings("slope=none", "gap=other"))
+    assert imitation.list_teachers(world.config.distillation) == ["other"]
+    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
+    keys = jax.random.split(jax.random.key(1), E)
+    _, seen, trace = jax.jit(lambda r: rollout.collect(world, nets, state.train, r, keys))(
+        state.robots
+    )
+    _, target, apart = imitation.ask_teachers(
+        world,
+        nets.actor,
+        state.teachers,
+        state.robots.memory.teacher,
+        seen,
+        trace.measures.level,
+    )
+    slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
+    for said in (target[..., 0], apart):
+        np.testing.assert_array_equal(jnp.isnan(said), np.broadcast_to(slopes, (T, E)))
+
+
 @pytest.mark.parametrize(
     ("teachers", "says"),
     [

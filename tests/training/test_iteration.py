@@ -56,7 +56,9 @@ def test_the_log_of_three_robots_over_two_steps_worked_by_hand():
         commanded=no + 1.0, steps=np.array([[50, 99, 7], [1, 100, 8]]),
         kind=np.tile([0, 1, 1], (2, 1)), level=no + 0, rank=np.array([[4, 5, 8], [3, 6, 8]]),
     )  # fmt: skip
-    trace = rollout.Trace(no + 1.0, ending, measures, np.tile([1.0, 2.0, 4.0], (2, 1)))
+    trace = rollout.Trace(
+        no + 1.0, ending, measures, np.array([[1.0, 2.0, 4.0], [1.0, 2.0, np.nan]])
+    )
     log = iteration._episode_log(jax.tree.map(jnp.asarray, trace), ("flat", "gap", "slope"), 0.02)
     expected = {
         "episode/length_s": 1.5,  # of 50 and of 100 steps
@@ -66,13 +68,13 @@ def test_the_log_of_three_robots_over_two_steps_worked_by_hand():
         "foothold/distance": 0.2,  # of 0.1 and 0.3 m
         "foothold/empty": 1 / 3,
         "walk/airborne": 3 / 12,
-        "teacher_kl/mean": 7 / 3,
+        "teacher_kl/mean": 10 / 5,  # robot 2 has no teacher in the second step
         "level/flat": 3.5,
         "level/gap": 6.75,
         "level/slope": 0.0,  # nobody is there
         "fell/flat": 1.0,
         "fell/gap": 0.0,
-        "teacher_kl/gap": 3.0,
+        "teacher_kl/gap": 8 / 3,
     }
     assert {k: float(log[k]) for k in expected} == pytest.approx(expected)
 
