@@ -123,7 +123,7 @@ def main(arguments: list[str] | None = None) -> None:
         if options.print_config:
             print(json.dumps(dataclasses.asdict(c), indent=2))
             return
-        train(options, c)
+        train(options, c, arguments)
 
 
 def parse(arguments: list[str]) -> tuple[Options, Config]:
@@ -174,7 +174,7 @@ def _options(arguments: list[str]) -> Options:
     return options
 
 
-def train(options: Options, c: Config) -> None:
+def train(options: Options, c: Config, arguments: list[str]) -> None:
     """Train until the last iteration, Ctrl-C or SIGTERM, then save."""
     if options.wandb:
         wandb_log.check_installed()
@@ -191,7 +191,7 @@ def train(options: Options, c: Config) -> None:
         with run_dir.checkpoints(run, c.run.keep) as steps:
             first = _first_iteration(steps, options.resume, run)
             lines = _opening_lines(run, c, mesh.size, options, first)
-            with _open_reporter(run, c, first, options) as report:
+            with _open_reporter(run, c, first, options, arguments) as report:
                 for line in lines:
                     report.say(line)
                 if processes.is_first() and map_files.is_map(c.terrain.name):
@@ -259,7 +259,7 @@ def _compile(
 
 @contextlib.contextmanager
 def _open_reporter(
-    run: Path, c: Config, first: int, options: Options
+    run: Path, c: Config, first: int, options: Options, arguments: list[str]
 ) -> Iterator[Reporter | SilentReporter]:
     """Write the run's settings and origin, and open its log; the first process alone does."""
     if not processes.is_first():
@@ -269,7 +269,8 @@ def _open_reporter(
     with run_dir.try_config(run, c):
         stages = distillation.samples_by_stage(c, first)
         engine = resolve_engine(options.engine)
-        run_dir.write_origin(run, first, c.terrain.name, engine, stages, c.run.num_envs)
+        size = c.run.num_envs
+        run_dir.write_origin(run, first, c.terrain.name, engine, stages, size, arguments)
         each, before = c.run.num_envs * c.ppo.horizon, run_dir.count_samples(run, c, first)
         wandb = dataclasses.asdict(c) if options.wandb else None
         with Reporter(

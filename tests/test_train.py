@@ -433,6 +433,7 @@ def test_a_run_learns_from_its_teachers_and_has_them_still_when_it_is_resumed(
     apart = [line["teacher_kl/flat"] for line in log]
     assert max(apart) > min(apart) > 0.0  # the teacher is the average, and the policy goes on
     assert sources.summarize(second).endswith(f", taught by {taught}")
+    assert run_dir.first_option(second, "init") == str(first)  # not what this process began with
 
 
 @pytest.mark.slow

@@ -205,10 +205,10 @@ def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
     c = policy.config
     stages = distillation.samples_by_stage(c, policy.iteration)
     start = [{}, *run_dir.read_starts(policy.run)][-1]
-    bare = lambda word: (
-        Path(word).name if Path(word).is_absolute() else word
-    )  # without private folders
-    start["command"] = [bare(word) for word in start.get("command", [])]
+    start["command"] = [_strip_folders(word) for word in start.get("command", [])]
+    settings = json.loads(json.dumps(dataclasses.asdict(c)))
+    taught = settings["distillation"]
+    taught["teachers"] = [_strip_folders(word) for word in taught["teachers"]]
     return {
         "exported": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "run": policy.run.name,
@@ -216,8 +216,14 @@ def _provenance(policy: TrainedPolicy) -> dict[str, Any]:
         "samples": policy.samples,
         **({"samples_by_stage": stages} if stages else {}),
         "trained_by": start,
-        "config": json.loads(json.dumps(dataclasses.asdict(c))),
+        "config": settings,
     }
+
+
+def _strip_folders(word: str) -> str:
+    """Strip private folders from a word of the command line, or from what it gives a value to."""
+    name, equals, value = word.rpartition("=")
+    return name + equals + (Path(value).name if Path(value).is_absolute() else value)
 
 
 def _evaluation(run: Path) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -68,19 +68,21 @@ def write_origin(
     engine: str = "",
     samples: Mapping[str, int] | None = None,
     num_envs: int | None = None,
+    arguments: Sequence[str] = (),
 ) -> None:
     """Append a line with the origin of this start: versions, device, command and git state.
 
     `iteration` is the number of iterations done before it, `terrain` a name or a map's file,
     `samples` those done by each stage of a run that has several, `num_envs` the robots from here
-    on. Starts without an iteration done are forgotten: nothing of theirs is left.
+    on, `arguments` the command line's. Starts without an iteration done are forgotten: nothing of
+    theirs is left.
     """
     line = {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "iteration": iteration,
         **({"num_envs": num_envs} if num_envs else {}),
         **({"samples": dict(samples)} if samples else {}),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "command": ["train", *arguments],
         "python": platform.python_version(),
         **machine(),
         "engine": engine,

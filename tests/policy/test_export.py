@@ -84,10 +84,15 @@ def test_a_policy_comes_back_as_it_went(directory, small_world):
 
 def test_the_manifest_has_the_command_and_no_one_s_folders(tmp_path):
     words = ["/home/someone/train.py", "--terrain", "gap", "--run-dir", "/home/someone/runs/gap"]
+    words += ["--distillation.teachers", "gap=/home/someone/runs/A", "flat:0-2=runs/B"]
     (tmp_path / "origin.jsonl").write_text(json.dumps({"command": words}) + "\n")
-    manifest = build_manifest(policy("full")._replace(run=tmp_path), ROBOT)
+    ours = policy("full")._replace(run=tmp_path)
+    taught = config.override(ours.config, {"distillation": {"teachers": words[-2:]}})
+    manifest = build_manifest(ours._replace(config=taught), ROBOT)
     command = manifest["provenance"]["trained_by"]["command"]
-    assert command == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
+    assert command[:5] == ["train.py", "--terrain", "gap", "--run-dir", "gap"]
+    teachers = manifest["provenance"]["config"]["distillation"]["teachers"]
+    assert teachers == command[6:] == ["gap=A", "flat:0-2=runs/B"]
     (tmp_path / "origin.jsonl").write_text('{"command": 5}\n')
     manifest = build_manifest(policy("full")._replace(run=tmp_path), ROBOT)
     assert manifest["provenance"]["trained_by"] == {"command": []}
