@@ -12,7 +12,7 @@ from cref_jax.robot.registry import describe as describe_robot
 from cref_jax.robot.registry import name_robot
 from cref_jax.training import run_dir
 
-BUNDLED = "mixed"  # the policy included in the package
+BUNDLED = "mixed"  # the policy taken where none is named and nothing is trained
 
 
 def resolve_policy(run: Path | None, policy: Path | None, robot: str | None = None) -> Path:
