@@ -106,6 +106,7 @@ RANGES: Ranges = {
         "narrow_view": Within(0, 1),
         "push_yaw_rate": Within(0, 100),
         "undisturbed": Within(0, 1),
+        "pushed_alone": Within(0, 1),
         "ramp_falls": Rising(0, 1e6),
         "ramp_step": Within(0, 1),
     },
@@ -238,6 +239,7 @@ def check(c: Config) -> None:
     _check_minibatches(c)
     _check_times(c)
     _check_learning_rate(c)
+    _check_shares(c)
     _check_footholds(c)
     _check_camera(c)
     _check_mirror(c)
@@ -273,6 +275,16 @@ def _check_learning_rate(c: Config) -> None:
         raise ConfigError(
             f"--ppo.learning-rate must be within --ppo.learning-rate-range, {low:g} to {high:g}, "
             f"not {c.ppo.learning_rate:g}"
+        )
+
+
+def _check_shares(c: Config) -> None:
+    """Refuse shares of robots that are more than all."""
+    alone = c.randomisation.undisturbed, c.randomisation.pushed_alone
+    if sum(alone) > 1.0:
+        raise ConfigError(
+            f"--randomisation.undisturbed and --randomisation.pushed-alone must be 1 together at "
+            f"most, not {alone[0]:g} and {alone[1]:g}"
         )
 
 

@@ -112,7 +112,7 @@ def _find_kind(
 def number_robots(c: config.Config, lanes: Atlas, num_envs: int) -> Int[np.ndarray, "E levels"]:
     """Number the teacher of each robot of a device on each level."""
     robots = np.arange(num_envs)
-    undisturbed = randomization_ramp.deal_undisturbed(c.randomisation, lanes, num_envs)
+    undisturbed = randomization_ramp.deal_parts(c.randomisation, lanes, num_envs).undisturbed
     return number_lanes(c, lanes)[undisturbed.astype(int), lanes.kind_of(robots)]
 
 

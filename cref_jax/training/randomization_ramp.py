@@ -4,7 +4,7 @@ A policy that falls at once under the full ranges learns nothing from them, and 
 falls has nothing left to learn from smaller ones.
 """
 
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import flax.struct
 import jax.numpy as jnp
@@ -32,12 +32,22 @@ def initial_ramp(c: config.Randomisation) -> Ramp:
     return Ramp(jnp.float32(0.0 if c.ramp else 1.0), jnp.float32(0.5 * (low + high)))
 
 
-def deal_undisturbed(
-    c: config.Randomisation, lanes: Atlas, num_envs: int
-) -> Bool[np.ndarray, " E"]:
-    """Deal out which robots of a device have nothing randomised, the same share on each lane."""
+class Parts(NamedTuple):
+    """Which robots of a device meet what; all others meet everything."""
+
+    undisturbed: Bool[np.ndarray, " E"]
+    pushed_alone: Bool[np.ndarray, " E"]
+
+
+def deal_parts(c: config.Randomisation, lanes: Atlas, num_envs: int) -> Parts:
+    """Deal out who meets what, the same shares on each lane.
+
+    Multiples of the golden ratio, modulo 1, fill [0, 1) evenly, however few turns there are.
+    """
     turn = np.arange(num_envs) // len(lanes.turns)
-    return np.floor((turn + 1) * c.undisturbed) > np.floor(turn * c.undisturbed)
+    place = np.modf(turn * 0.5 * (np.sqrt(5.0) - 1.0))[0]
+    undisturbed = place < c.undisturbed
+    return Parts(undisturbed, ~undisturbed & (place < c.undisturbed + c.pushed_alone))
 
 
 def update_ramp(ramp: Ramp, falls: Float[Array, ""], c: config.Randomisation) -> Ramp:

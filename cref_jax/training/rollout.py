@@ -173,8 +173,9 @@ def with_randomization(world: World, robots: Robots, share: Float[Array, ""]) ->
 
 def _spread_by_robot(world: World, share: Float[Array, ""], num_envs: int) -> Spread:
     c = world.config.randomisation
-    undisturbed = randomization_ramp.deal_undisturbed(c, world.lanes, num_envs)
-    return even_spread(jnp.where(undisturbed, 0.0, share))
+    parts = randomization_ramp.deal_parts(c, world.lanes, num_envs)
+    spread = even_spread(jnp.where(parts.undisturbed | parts.pushed_alone, 0.0, share))
+    return spread._replace(pushes=jnp.where(parts.undisturbed, 0.0, share))
 
 
 def with_twins(robots: Robots) -> Robots:

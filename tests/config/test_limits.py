@@ -168,6 +168,10 @@ def test_the_settings_of_a_run_are_checked(tmp_path: Path, stored: Any, says: st
         ({"ppo": {"learning_rate": 0.1}}, "within --ppo.learning-rate-range, 1e-05 to 0.01"),
         ({"physics": {"substeps": 100}}, "must be 0.001 to 0.1 s, not 0.5"),
         ({"randomisation": {"action_delay": 0.03}}, "at most a control step, 0.02 s, not 0.03"),
+        (
+            {"randomisation": {"undisturbed": 0.6, "pushed_alone": 0.5}},
+            "must be 1 together at most, not 0.6 and 0.5",
+        ),
         ({"foothold": {"window": [61, 5]}}, "--foothold.window, 61 5, must be at most as long and"),
         ({"foothold": {"window": [12, 4]}}, "exactly as wide as --foothold.points, 60 5"),
         ({"foothold": {"min_points": 61}}, "at most the 60 of --foothold.window, not 61"),

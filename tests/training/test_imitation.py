@@ -56,7 +56,7 @@ def test_robots_with_nothing_randomised_have_a_teacher_of_their_own(world):
     assert disturbed[slope].tolist() == [2, 2, 2] and disturbed[flat].tolist() == [0, 0, 0]
     assert undisturbed[slope].tolist() == [2, 1, 1] and undisturbed[flat].tolist() == [0, 1, 1]
     numbers = imitation.number_robots(c, world.lanes, E)
-    chosen = randomization_ramp.deal_undisturbed(c.randomisation, world.lanes, E)
+    chosen = randomization_ramp.deal_parts(c.randomisation, world.lanes, E).undisturbed
     assert 0 < chosen.sum() < E
     for robot, apart in enumerate(chosen):
         kind = world.lanes.kind_of(np.array([robot]))[0]

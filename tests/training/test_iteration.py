@@ -91,19 +91,22 @@ def test_the_first_episodes_are_randomised_as_much_as_the_ramp_says(ramp):
     assert math.isfinite(float(robots.env.body.qpos.sum()))
 
 
-def test_undisturbed_robots_stay_so_while_the_others_meet_everything():
-    changes = {"randomisation": {"enabled": True, "undisturbed": 0.5}}
+def test_some_robots_stay_undisturbed_or_are_pushed_alone_while_the_others_meet_everything():
     world = small_world.world()
-    c = config.override(small_world.C, changes)
+    shares = {"enabled": True, "undisturbed": 0.3, "pushed_alone": 0.3}
+    c = config.override(small_world.C, {"randomisation": shares})
     world = world.replace(config=c)
-    undisturbed = randomization_ramp.deal_undisturbed(c.randomisation, world.lanes, 28)
-    assert 0 < undisturbed.sum() < 28
-    keys = jax.random.split(jax.random.key(0), 28)
+    count = 5 * len(world.lanes.turns)
+    undisturbed, pushed = randomization_ramp.deal_parts(c.randomisation, world.lanes, count)
+    others = ~undisturbed & ~pushed
+    assert undisturbed.any() and pushed.any() and others.any()
+    keys = jax.random.split(jax.random.key(0), count)
     robots = jax.jit(rollout.start)(world, keys)
-    np.testing.assert_array_equal(robots.env.dynamics.payload == 0.0, undisturbed)
-    np.testing.assert_array_equal(robots.env.spread.mass, np.where(undisturbed, 0.0, 1.0))
-    later = rollout.with_randomization(world, robots, jnp.float32(0.25))
-    np.testing.assert_array_equal(later.env.spread.pushes, np.where(undisturbed, 0.0, 0.25))
+    np.testing.assert_array_equal(robots.env.dynamics.payload != 0.0, others)
+    np.testing.assert_array_equal(robots.env.spread.pushes, np.where(undisturbed, 0.0, 1.0))
+    later = rollout.with_randomization(world, robots, jnp.float32(0.25)).env.spread
+    np.testing.assert_array_equal(later.pushes, np.where(undisturbed, 0.0, 0.25))
+    np.testing.assert_array_equal(later.noise, np.where(others, 0.25, 0.0))
 
 
 @pytest.mark.parametrize("enabled", [True, False])

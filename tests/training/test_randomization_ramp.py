@@ -57,10 +57,21 @@ def test_many_falls_lower_it_and_in_between_it_stays():
     assert float(after(3.0, 50, calm).share) == float(calm.share)
 
 
-@pytest.mark.parametrize(("share", "of_five"), [(0.0, 0), (0.4, 2), (0.5, 2), (1.0, 5)])
-def test_the_same_number_of_robots_on_each_lane_is_undisturbed(share: float, of_five: int):
+@pytest.mark.parametrize(
+    ("undisturbed", "pushed", "of_five"),  # multiples of the golden ratio: 0, .62, .24, .85, .47
+    [
+        (0.0, 0.0, (0, 0)),
+        (0.4, 0.0, (2, 0)),
+        (0.4, 0.1, (2, 1)),
+        (0.0, 0.9, (0, 5)),
+        (1.0, 0.0, (5, 0)),
+    ],
+)
+def test_the_same_robots_of_each_turn_of_kinds_meet_less(undisturbed, pushed, of_five):
     lanes = small_world.world().lanes
     turns = len(lanes.turns)
-    c = dataclasses.replace(C, undisturbed=share)
-    chosen = randomization_ramp.deal_undisturbed(c, lanes, 5 * turns)
-    assert [int(chosen[first::turns].sum()) for first in range(turns)] == turns * [of_five]
+    c = dataclasses.replace(C, undisturbed=undisturbed, pushed_alone=pushed)
+    for dealt, expected in zip(
+        randomization_ramp.deal_parts(c, lanes, 5 * turns), of_five, strict=True
+    ):
+        assert [int(dealt[first::turns].sum()) for first in range(turns)] == turns * [expected]
