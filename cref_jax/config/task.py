@@ -116,8 +116,8 @@ class Randomisation:
     depth_holes: float = 0.0  # share of the image without a reading, up to
     narrow_view: float = 0.0  # chance of a camera that shows 75 x 62 deg, as at 640 x 480
     push_yaw_rate: float = 0.0  # rad/s, up to, with each push, as of a wrist that meets a rail
-    undisturbed: float = 0.0  # share of robots with nothing of it, in training
-    pushed_alone: float = 0.0  # share of robots with nothing of it but pushes, in training
+    undisturbed: float = 0.0  # share of robots for which nothing is randomised, in training
+    pushed_alone: float = 0.0  # share of robots that are pushed, with nothing else randomised
     ramp: bool = False  # begin with none of it, and let it grow with competence
     ramp_falls: tuple[float, float] = (2.5, 4.0)  # per minute: fewer raise, more lower; assumed
     ramp_step: float = 0.005  # of all ranges, per iteration; assumed
