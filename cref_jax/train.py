@@ -271,7 +271,7 @@ def _open_reporter(
         engine = resolve_engine(options.engine)
         size = c.run.num_envs
         run_dir.write_origin(run, first, c.terrain.name, engine, stages, size, arguments)
-        each, before = c.run.num_envs * c.ppo.horizon, run_dir.count_samples(run, c, first)
+        each, before = size * c.ppo.horizon, run_dir.count_samples(run, c, first)
         wandb = dataclasses.asdict(c) if options.wandb else None
         with Reporter(
             run, first, c.run.iterations, each, before, options.tensorboard, wandb

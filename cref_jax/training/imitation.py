@@ -3,7 +3,7 @@
 The student acts, and each teacher says what it would do in the states that are visited on its lanes
 (DAgger, Ross et al. 2011); how far the student is from that is one more loss of PPO (kickstarting,
 arXiv 1803.03835). Lanes that no other teacher has are the first one's: the policy that the run
-begins as.
+begins as. Robots for which nothing is randomised may have another, and lanes none at all.
 """
 
 import re
@@ -127,8 +127,8 @@ def ask_teachers(
     """Compute what each robot's teacher would have done in a rollout on lanes of these levels.
 
     Returns the teachers' memory after it, their mean actions, and how far the policy's are from
-    them (nats, at its deviations), both NaN where nobody teaches. The kinds of
-    lane are dealt out by the robots' numbers, so that each teacher sees the robots on its own kinds
+    them (nats, at its deviations), both NaN where nobody teaches. The kinds of lane
+    are dealt out by the robots' numbers, so that each teacher sees the robots on its own kinds
     alone. A robot comes to another level, and so to another teacher, only where an episode begins,
     with an empty memory.
     """

@@ -1,4 +1,4 @@
-"""Randomisation that grows with competence: one share of all its ranges, for all robots.
+"""Randomisation that grows with competence: one share of its ranges, for all who meet it.
 
 A policy that falls at once under the full ranges learns nothing from them, and one that hardly
 falls has nothing left to learn from smaller ones.
