@@ -69,8 +69,11 @@ class Distillation:
     learning_rate: float = 3e-4  # Humanoid Parkour Learning's code for quadrupeds
     teachers: tuple[str, ...] = ()
     """KIND=POLICY, or KIND:FIRST-LAST=POLICY for these levels: whom to imitate on lanes of this
-    kind; on all others it is --init. undisturbed=POLICY: on all kinds, with nothing randomised.
-    KIND=none: PPO alone"""
+    kind; on all others it is --init. undisturbed=POLICY, undisturbed/KIND=POLICY: for robots with
+    nothing randomised. KIND=none: PPO alone"""
+    true_senses: bool = False
+    """Teachers sense without noise, errors of encoders and faults of depth, and so say what the
+    student would do if it knew better"""
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ class Measures(NamedTuple):
     progress: Float[Array, ""]  # m from the start along the lane
     commanded: Float[Array, ""]  # m asked for
     steps: Int[Array, ""]  # control steps in the episode, this one included
+    pushed: Bool[Array, ""]  # at the beginning of this step
     kind: Int[Array, ""]
     level: Int[Array, ""]
     rank: Int[Array, ""]
@@ -148,6 +149,7 @@ def _step_without_reset(
 ) -> _Reached:
     """Advance one control step as if the episode continued."""
     c = world.config
+    pushed = events.is_push_due(world, state)
     state = events.apply_push(world, state.replace(key=keys[0]), draws)
     action = jnp.clip(action, -c.robot.action_clip, c.robot.action_clip)
 
@@ -170,7 +172,7 @@ def _step_without_reset(
     lived = _next_state(world, state, body, soles, snapshot)
     gained, terms = rewards.total(snapshot, c.reward, world.physics.robot)
     ending = terminations.check_termination(world, lived, links, unstable)
-    measures = _measures(lived, snapshot, terms)
+    measures = _measures(lived, snapshot, terms, pushed)
     lived = commands.update_command(world, terminations.record_progress(world, lived), draws)
     last = observe(world, lived, keys[5])
 
@@ -194,10 +196,25 @@ def _reset_if_over(
 
 def depth_image(world: World, state: EnvState, is_profile: bool = False) -> Float[Array, "H W"]:
     """Render D, the normalised depth image of ground and links, with the camera's faults."""
-    camera = world.config.camera
+    return _to_image(world, _misread(world, state, render_depth(world, state, is_profile)))
+
+
+def depth_images(
+    world: World, state: EnvState, is_profile: bool = False
+) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
+    """Render D as `depth_image` does, and the same without the camera's faults."""
     metres = render_depth(world, state, is_profile)
-    if depth_faults.has_faults(world.config.randomisation):
-        metres = depth_faults.misread(world, state, metres)
+    return _to_image(world, _misread(world, state, metres)), _to_image(world, metres)
+
+
+def _misread(world: World, state: EnvState, metres: Float[Array, "H W"]) -> Float[Array, "H W"]:
+    if not depth_faults.has_faults(world.config.randomisation):
+        return metres
+    return depth_faults.misread(world, state, metres)
+
+
+def _to_image(world: World, metres: Float[Array, "H W"]) -> Float[Array, "H W"]:
+    camera = world.config.camera
     return depth.normalize(depth.min_filter(metres, camera.window), camera)
 
 
@@ -317,6 +334,7 @@ def _measures(
     state: EnvState,
     s: rewards.Snapshot,
     terms: dict[str, Float[Array, ""]],
+    pushed: Bool[Array, ""],
 ) -> Measures:
     return Measures(
         terms=terms,
@@ -329,6 +347,7 @@ def _measures(
         progress=state.body.qpos[0] - state.start[0],
         commanded=state.commanded,
         steps=state.step,
+        pushed=pushed,
         kind=state.kind,
         level=state.level,
         rank=state.rank,

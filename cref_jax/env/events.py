@@ -11,8 +11,12 @@ from cref_jax.env.world import World
 
 def is_draw_due(world: World, state: EnvState) -> Bool[Array, ""]:
     """Return whether a push or a new command is due in this step."""
-    due = state.command_left <= 0
-    return due | (state.push_left <= 0) if world.config.randomisation.enabled else due
+    return (state.command_left <= 0) | is_push_due(world, state)
+
+
+def is_push_due(world: World, state: EnvState) -> Bool[Array, ""]:
+    """Return whether a push is due in this step."""
+    return world.config.randomisation.enabled & (state.push_left <= 0)
 
 
 def draw(world: World, state: EnvState, key_push: PRNGKeyArray, key_command: PRNGKeyArray) -> Draws:
@@ -36,7 +40,7 @@ def apply_push(world: World, state: EnvState, draws: Draws) -> EnvState:
     """Add a sudden planar velocity, and a turn, to the base when a push is due."""
     if not world.config.randomisation.enabled:
         return state
-    due = state.push_left <= 0
+    due = is_push_due(world, state)
     share = jnp.where(due, state.spread.pushes, 0.0)
     qvel = state.body.qvel.at[:2].add(share * draws.shove)
     if world.config.randomisation.push_yaw_rate > 0.0:

@@ -1,19 +1,22 @@
 """The cameras of all robots, on one clock: frames are rendered, held and delivered."""
 
 import functools
+from collections.abc import Callable
 from typing import no_type_check
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float16, Int
+from jaxtyping import Array, Bool, Float, Float16, Int, PyTree
 
 from cref_jax import config, depth, network
 from cref_jax.env import environment
 from cref_jax.env.state import EnvState
 from cref_jax.env.world import World
 from cref_jax.system import xla_kernels
+
+Images = PyTree[Float[Array, "H W"]]
 
 
 @no_type_check  # vmap and tree.map fill it with batches and with non-arrays
@@ -25,6 +28,7 @@ class CameraFeed:
     seen: Bool[Array, " E"]  # the frame is of this episode
     fresh: Bool[Array, ""]  # the frame came in the last step
     clock: Int[Array, ""]  # control steps since the cameras started
+    clear: Float16[Array, "E rows columns pixels"] | None = None  # without faults, for teachers
 
     def images(self, c: config.Network) -> Float16[Array, "E H W"]:
         """Convert the frames to images."""
@@ -32,7 +36,14 @@ class CameraFeed:
 
 
 def render_frames(world: World, state: EnvState) -> Float16[Array, "E rows columns pixels"]:
-    """Render every robot's depth image, in the network's patch order.
+    """Render every robot's depth image, in the network's patch order."""
+    return _render_all(world, state, environment.depth_image)
+
+
+def _render_all(
+    world: World, state: EnvState, look: Callable[..., Images]
+) -> PyTree[Float16[Array, "E rows columns pixels"]]:
+    """Render every robot's images, in the network's patch order.
 
     `start` assigns each robot its kind of lane for good, so it is known at compile time which lanes
     are level across; their images are cheaper.
@@ -44,17 +55,22 @@ def render_frames(world: World, state: EnvState) -> Float16[Array, "E rows colum
         some = np.flatnonzero(is_profile == flag)
         if some.size:
             part = jax.tree.map(lambda x, some=some: x[some], state)
-            render = xla_kernels.as_own_kernel(functools.partial(_render_images, is_profile=flag))
+            render = functools.partial(_render_images, look=look, is_profile=flag)
+            render = xla_kernels.as_own_kernel(render)
             images.append(xla_kernels.materialize(render(world, part)))
             robots.append(some)
-    image = jnp.concatenate(images)[np.argsort(np.concatenate(robots))]
-    return network.image_to_patches(world.config.network, image)
+    order = np.argsort(np.concatenate(robots))
+    to_patches = functools.partial(network.image_to_patches, world.config.network)
+    return jax.tree.map(lambda *parts: to_patches(jnp.concatenate(parts)[order]), *images)
 
 
-def _render_images(world: World, state: EnvState, is_profile: bool) -> Float16[Array, "E H W"]:
+def _render_images(
+    world: World, state: EnvState, look: Callable[..., Images], is_profile: bool
+) -> PyTree[Float16[Array, "E H W"]]:
     """Render the images of robots that are all on lanes level across, or all not."""
-    render = functools.partial(environment.depth_image, is_profile=is_profile)
-    return jax.vmap(render, in_axes=(None, 0))(world, state).astype(jnp.float16)
+    each = functools.partial(look, is_profile=is_profile)
+    images = jax.vmap(each, in_axes=(None, 0))(world, state)
+    return jax.tree.map(lambda image: image.astype(jnp.float16), images)
 
 
 def empty_feed(c: config.Config, num_envs: int) -> CameraFeed:
@@ -78,5 +94,11 @@ def update_feed(
     """
     c, clock = world.config, feed.clock + 1
     due = depth.is_due(clock, c.camera, c.physics.control_period)
-    frame = jax.lax.cond(due, lambda: render_frames(world, before), lambda: feed.frame)
-    return CameraFeed(frame=frame, seen=(feed.seen | due) & ~over, fresh=due, clock=clock)
+    if feed.clear is None:
+        frame = jax.lax.cond(due, lambda: render_frames(world, before), lambda: feed.frame)
+        clear = None
+    else:
+        both = lambda: _render_all(world, before, environment.depth_images)
+        frame, clear = jax.lax.cond(due, both, lambda: (feed.frame, feed.clear))
+    seen = (feed.seen | due) & ~over
+    return CameraFeed(frame=frame, seen=seen, fresh=due, clock=clock, clear=clear)

@@ -3,28 +3,35 @@
 The student acts, and each teacher says what it would do in the states that are visited on its lanes
 (DAgger, Ross et al. 2011); how far the student is from that is one more loss of PPO (kickstarting,
 arXiv 1803.03835). Lanes that no other teacher has are the first one's: the policy that the run
-begins as. Robots for which nothing is randomised may have another, and lanes none at all.
+begins as. Robots for which nothing is randomised may have another, and lanes none at all. Robots
+that are only pushed have that other one as well, but not in the seconds after a push: until it
+comes, nothing tells them from robots that are left alone.
 """
 
+import functools
 import re
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from cref_jax import config, network, ppo
 from cref_jax.config.overrides import describe_unknown
+from cref_jax.env.environment import Measures
 from cref_jax.env.world import World
 from cref_jax.errors import ConfigError
 from cref_jax.ppo import gaussian
 from cref_jax.terrain.atlas import Atlas
 from cref_jax.training import randomization_ramp
+from cref_jax.training.rollout import Robots
 
-UNDISTURBED = "undisturbed"  # in place of a kind: robots for which nothing is randomised
+UNDISTURBED = "undisturbed"  # before a kind, or in its place: robots with nothing randomised
 NOBODY = "none"  # in place of a policy: these robots learn by PPO alone
+AFTER_PUSH = 3.0  # s for which who is pushed alone has the disturbed robots' teacher; assumed
 _UNSAID, _ALONE = -1, -2  # in place of a teacher's number
+_LONG_AGO = 2**20  # control steps since a push that never was
 
 
 class Teacher(NamedTuple):
@@ -34,10 +41,18 @@ class Teacher(NamedTuple):
     obs: ppo.RunningStatistics
 
 
+class TeacherMemory(NamedTuple):
+    """What the teachers of E robots remember between two rollouts."""
+
+    disturbed: network.Carry
+    undisturbed: network.Carry
+    since_push: Int[Array, " E"]  # control steps since the last push of the episode
+
+
 class Lesson(NamedTuple):
     """Lanes on which a policy is imitated."""
 
-    kind: str  # or UNDISTURBED
+    who: str  # a kind, UNDISTURBED, or UNDISTURBED/kind
     levels: tuple[int, int] | None  # first and last; None: all
     policy: str  # or NOBODY
 
@@ -77,76 +92,140 @@ def number_lanes(c: config.Config, lanes: Atlas) -> Int[np.ndarray, "2 kinds lev
             one for robots that do not exist.
     """
     names = list_teachers(c.distillation)
-    numbers = np.full((2, len(lanes.kinds), lanes.levels), _UNSAID)
-    for kind, levels, policy in read_lessons(c.distillation):
+    numbers = np.full((3, len(lanes.kinds), lanes.levels), _UNSAID)  # [2]: undisturbed, any kind
+    for who, levels, policy in read_lessons(c.distillation):
         first, last = levels or (0, lanes.levels - 1)
         if not first <= last < lanes.levels:
             raise ConfigError(
-                f"--distillation.teachers: '{kind}:{first}-{last}' must be levels that rise, of 0 "
+                f"--distillation.teachers: '{who}:{first}-{last}' must be levels that rise, of 0 "
                 f"to {lanes.levels - 1}"
             )
-        own = _find_kind(c, lanes, numbers, kind)[..., first : last + 1]
+        own = _find_lanes(c, lanes, numbers, who)[..., first : last + 1]
         if (own != _UNSAID).any():
-            raise ConfigError(f"--distillation.teachers: two for a level of '{kind}'; give one")
+            raise ConfigError(f"--distillation.teachers: two for a level of '{who}'; give one")
         own[:] = _ALONE if policy == NOBODY else names.index(policy) + 1
-    disturbed = np.where(numbers[0] == _UNSAID, 0, numbers[0])
-    return np.stack([disturbed, np.where(numbers[1] == _UNSAID, disturbed, numbers[1])])
+    otherwise = lambda said, rest: np.where(said == _UNSAID, rest, said)
+    disturbed = otherwise(numbers[0], 0)
+    return np.stack([disturbed, otherwise(otherwise(numbers[1], numbers[2]), disturbed)])
 
 
-def _find_kind(
-    c: config.Config, lanes: Atlas, numbers: Int[np.ndarray, "2 kinds levels"], kind: str
+def _find_lanes(
+    c: config.Config, lanes: Atlas, numbers: Int[np.ndarray, "3 kinds levels"], who: str
 ) -> Int[np.ndarray, "*kinds levels"]:
-    """Find the part of the numbers that an entry of this kind is about."""
-    if kind == UNDISTURBED:
-        if not c.randomisation.undisturbed:
-            raise ConfigError(
-                f"--distillation.teachers: '{kind}' needs --randomisation.undisturbed above 0"
-            )
-        return numbers[1]
-    if kind not in lanes.kinds:
-        unknown = describe_unknown("kind of lane", kind, [*lanes.kinds, UNDISTURBED])
+    """Find the part of the numbers that an entry is about."""
+    group, _, kind = who.rpartition("/")
+    is_known = kind in lanes.kinds and group in ("", UNDISTURBED)
+    if who != UNDISTURBED and not is_known:
+        unknown = describe_unknown("kind of lane", who, [*lanes.kinds, UNDISTURBED])
         raise ConfigError(f"--distillation.teachers: {unknown}")
-    return numbers[0, lanes.kinds.index(kind)]
+    has_calm = c.randomisation.undisturbed > 0.0 or c.randomisation.pushed_alone > 0.0
+    if UNDISTURBED in (who, group) and not has_calm:
+        raise ConfigError(
+            f"--distillation.teachers: '{who}' needs --randomisation.undisturbed above 0"
+        )
+    if who == UNDISTURBED:
+        return numbers[2]
+    return numbers[int(group == UNDISTURBED), lanes.kinds.index(kind)]
 
 
-def number_robots(c: config.Config, lanes: Atlas, num_envs: int) -> Int[np.ndarray, "E levels"]:
-    """Number the teacher of each robot of a device on each level."""
-    robots = np.arange(num_envs)
-    undisturbed = randomization_ramp.deal_parts(c.randomisation, lanes, num_envs).undisturbed
-    return number_lanes(c, lanes)[undisturbed.astype(int), lanes.kind_of(robots)]
+def number_robots(c: config.Config, lanes: Atlas, num_envs: int) -> Int[np.ndarray, "2 E levels"]:
+    """Number the two teachers of each robot of a device on each level, as `number_lanes` does.
+
+    Below 0 where there is none: undisturbed robots never have the disturbed ones' teacher, and of
+    the others those that are only pushed have both.
+    """
+    parts = randomization_ramp.deal_parts(c.randomisation, lanes, num_envs)
+    numbers = number_lanes(c, lanes)[:, lanes.kind_of(np.arange(num_envs))]
+    numbers[0, parts.undisturbed] = _ALONE
+    numbers[1, ~(parts.undisturbed | parts.pushed_alone)] = _ALONE
+    return numbers
+
+
+def with_teachers(robots: Robots, c: config.Distillation) -> Robots:
+    """Add an empty memory of the teachers, which is like the student's, and what they see."""
+    blank = lambda: jax.tree.map(jnp.zeros_like, robots.memory.carry)
+    since = jnp.full(robots.begins.shape, _LONG_AGO)
+    memory = TeacherMemory(blank(), blank(), since)
+    feed = robots.feed
+    if feed is not None and c.true_senses:
+        feed = feed.replace(clear=jnp.zeros_like(feed.frame))
+    return robots.replace(memory=robots.memory._replace(teacher=memory), feed=feed)
 
 
 def ask_teachers(
     world: World,
     actor: network.Actor,
     teachers: tuple[Teacher, ...],
+    memory: TeacherMemory,
+    rollout: ppo.Rollout,
+    measures: Measures,
+) -> tuple[TeacherMemory, Float[Array, "T E J"], Float[Array, "T E"]]:
+    """Compute what each robot's teacher would have done in a rollout, measured in each step.
+
+    Returns the teachers' memory after it, their mean actions, and how far the policy's are from
+    them (nats, at its deviations), both NaN where nobody teaches.
+    """
+    c, num_envs = world.config, rollout.begins.shape[1]
+    clean = ppo.zero_invalid(rollout)
+    if c.distillation.true_senses:
+        obs = clean.critic_obs[..., : clean.obs.shape[-1]]  # s_t begins with o^p_t without noise
+        clean = clean._replace(obs=obs, sight=clean.guide)
+    numbers = number_robots(c, world.lanes, num_envs)
+    ask = functools.partial(_ask_group, actor, teachers, rollout=clean, level=measures.level)
+    disturbed, target = ask(numbers[0], memory.disturbed)
+    undisturbed, target_undisturbed = ask(numbers[1], memory.undisturbed)
+    since, before = _count_since_push(memory.since_push, rollout.begins, measures.pushed)
+    parts = randomization_ramp.deal_parts(c.randomisation, world.lanes, num_envs)
+    is_calm = before >= round(AFTER_PUSH / c.physics.control_period)
+    is_undisturbed = parts.undisturbed | (parts.pushed_alone & is_calm)
+    target = jnp.where(is_undisturbed[..., None], target_undisturbed, target)
+    apart = gaussian.kl_of_means(target, clean.mean, rollout.log_std[0, 0])
+    return TeacherMemory(disturbed, undisturbed, since), target, apart
+
+
+def _count_since_push(
+    since: Int[Array, " E"], begins: Bool[Array, "T E"], pushed: Bool[Array, "T E"]
+) -> tuple[Int[Array, " E"], Int[Array, "T E"]]:
+    """Count control steps since the last push of the episode: after a rollout, before each step.
+
+    The push of a step comes after what is observed before it.
+    """
+
+    def count(since: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        begins, pushed = step
+        before = jnp.where(begins, _LONG_AGO, since)
+        return jnp.where(pushed, 0, before + 1), before
+
+    return jax.lax.scan(count, since, (begins, pushed))
+
+
+def _ask_group(
+    actor: network.Actor,
+    teachers: tuple[Teacher, ...],
+    numbers: Int[np.ndarray, "E levels"],
     memory: network.Carry,
     rollout: ppo.Rollout,
     level: Int[Array, "T E"],
-) -> tuple[network.Carry, Float[Array, "T E J"], Float[Array, "T E"]]:
-    """Compute what each robot's teacher would have done in a rollout on lanes of these levels.
+) -> tuple[network.Carry, Float[Array, "T E J"]]:
+    """Compute what the teachers with these numbers remember, and their mean actions; NaN: none.
 
-    Returns the teachers' memory after it, their mean actions, and how far the policy's are from
-    them (nats, at its deviations), both NaN where nobody teaches. The kinds of lane
-    are dealt out by the robots' numbers, so that each teacher sees the robots on its own kinds
-    alone. A robot comes to another level, and so to another teacher, only where an episode begins,
-    with an empty memory.
+    The kinds of lane are dealt out by the robots' numbers, so that each teacher sees the robots on
+    its own kinds alone. A robot comes to another level, and so to another teacher, only where an
+    episode begins, with an empty memory.
     """
-    clean = ppo.zero_invalid(rollout)
-    numbers = number_robots(world.config, world.lanes, rollout.begins.shape[1])
-    before, target = memory, jnp.full_like(clean.mean, jnp.nan)
+    before, target = memory, jnp.full_like(rollout.mean, jnp.nan)
     for number, teacher in enumerate(teachers):
         own = np.flatnonzero((numbers == number).any(axis=1))
         if not own.size:
             continue
-        obs = ppo.normalize(teacher.obs, clean.obs[:, own])
-        sight = jax.tree.map(lambda x, own=own: x[:, own], clean.sight)
+        obs = ppo.normalize(teacher.obs, rollout.obs[:, own])
+        sight = jax.tree.map(lambda x, own=own: x[:, own], rollout.sight)
         carry = jax.tree.map(lambda x, own=own: x[own], before)
-        carry, said = actor.apply(teacher.actor, carry, obs, clean.begins[:, own], sight)
+        carry, said = actor.apply(teacher.actor, carry, obs, rollout.begins[:, own], sight)
         asked = jnp.asarray(numbers)[own, level[:, own]][..., None] == number
         keep = lambda old, new, own=own, asked=asked[-1]: old.at[own].set(
             jnp.where(asked, new, old[own])
         )
         target = target.at[:, own].set(jnp.where(asked, said.mean, target[:, own]))
         memory = jax.tree.map(keep, memory, carry)
-    return memory, target, gaussian.kl_of_means(target, clean.mean, rollout.log_std[0, 0])
+    return memory, target

@@ -53,7 +53,10 @@ def initial_state(world: World, mesh: Mesh | None = None) -> RunState:
 
     def start(world: World, key: Array) -> rollout.Robots:
         robots = rollout.start(world, _robot_keys(key, c.run.num_envs // mesh.size))
-        robots = rollout.with_teachers(robots) if _has_teacher(c) else robots
+        if c.ppo.imitation_weight:
+            robots = imitation.with_teachers(robots, c.distillation)
+        elif c.network.variant == "hpl":
+            robots = rollout.with_teacher(robots)
         return rollout.with_twins(robots) if c.ppo.mirror_weight else robots
 
     sharded_start = jax.shard_map(
@@ -195,9 +198,9 @@ def _reinforce(
     taught = robots.memory.teacher
     robots, experience, trace = rollout.collect(world, nets, train, robots, keys.robots)
     if teachers:
-        level = trace.measures.level
-        asked = imitation.ask_teachers(world, nets.actor, teachers, taught, experience, level)
-        taught, target, teacher_kl = asked
+        taught, target, teacher_kl = imitation.ask_teachers(
+            world, nets.actor, teachers, taught, experience, trace.measures
+        )
         experience = experience._replace(target=target)
         trace = trace._replace(teacher_kl=teacher_kl)
         robots = robots.replace(memory=robots.memory._replace(teacher=taught))
@@ -228,7 +231,10 @@ def _stage_samples(c: config.Config, iteration: Int[Array, ""]) -> Log:
 def partition(world: World) -> RunState:
     """Return the partition specs of a run's state: robots are sharded, the rest is replicated."""
     c = world.config
-    robots = rollout.partition(AXIS, c.network, c.ppo.mirror_weight > 0.0, _has_teacher(c))
+    has_clear = c.ppo.imitation_weight > 0.0 and c.distillation.true_senses
+    robots = rollout.partition(
+        AXIS, c.network, c.ppo.mirror_weight > 0.0, _has_teacher(c), has_clear
+    )
     return RunState(train=P(), robots=robots, ramp=P(), teachers=P())
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Float16, Int, Key, PRNGKeyArray, PyTree
 
 from cref_jax import config, depth, network, ppo
 from cref_jax.env import environment, resets
@@ -30,7 +30,7 @@ class Memory(NamedTuple):
     carry: network.Carry
     features: network.Features | None  # of the current frame, [1, E, ...]; None for a blind policy
     twin: "Memory | None" = None  # of the mirrored policy, if symmetry is taught
-    teacher: network.Carry | None = None  # of the policy that this one learns from, if any
+    teacher: PyTree = None  # of the policies that this one learns from, if any
 
 
 @no_type_check
@@ -88,10 +88,15 @@ class Trace(NamedTuple):
 
 
 def partition(
-    axis: str, c: config.Network, has_twin: bool = False, has_teacher: bool = False
+    axis: str,
+    c: config.Network,
+    has_twin: bool = False,
+    has_teacher: bool = False,
+    has_clear: bool = False,
 ) -> Robots:
     """Return the partition spec of each array over the robots' `axis`; clocks are replicated."""
     robots = P(axis)
+    feed = CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P())
     memory = Memory(robots, P(None, axis) if c.sees else None)
     return Robots(
         env=robots,
@@ -100,7 +105,7 @@ def partition(
             twin=memory if has_twin else None, teacher=robots if has_teacher else None
         ),
         begins=robots,
-        feed=CameraFeed(frame=robots, seen=robots, fresh=P(), clock=P()) if c.sees else None,
+        feed=feed.replace(clear=robots if has_clear else None) if c.sees else None,
     )
 
 
@@ -184,7 +189,7 @@ def with_twins(robots: Robots) -> Robots:
     return robots.replace(memory=robots.memory._replace(twin=blank))
 
 
-def with_teachers(robots: Robots) -> Robots:
+def with_teacher(robots: Robots) -> Robots:
     """Add an empty memory of the teacher, which is like the student's."""
     blank = jax.tree.map(jnp.zeros_like, robots.memory.carry)
     return robots.replace(memory=robots.memory._replace(teacher=blank))
@@ -298,7 +303,7 @@ def collect(
     collection, steps = jax.lax.scan(step, _start_buffer(c, robots), noise)
     after = collection.robots
     after = after.replace(memory=_clear_features(after.memory))
-    rollout = _to_rollout(c, nets, train, first.memory, collection.frames, steps)
+    rollout = _to_rollout(c, nets, train, first.memory, collection, steps)
     outcome = steps.outcome
     return after, rollout, Trace(outcome.reward, outcome.ending, outcome.measures)
 
@@ -317,28 +322,30 @@ class _Collection:
     robots: Robots
     frames: Float16[Array, "K E rows columns pixels"] | None
     frame_index: Int[Array, ""]  # of the current frame in `frames`
+    clear: Float16[Array, "K E rows columns pixels"] | None = None  # as in CameraFeed
 
 
 def _start_buffer(c: config.Config, robots: Robots) -> _Collection:
     """Start a horizon, with the current frame first in the buffer."""
-    frames = None
+    frames, clear = None, None
     if robots.feed is not None:
         count = 1 + depth.max_frames(c.ppo.horizon - 1, c.camera, c.physics.control_period)
-        frames = jnp.zeros((count, *robots.feed.frame.shape), robots.feed.frame.dtype)
-        frames = frames.at[0].set(robots.feed.frame)
-    return _Collection(robots, frames, jnp.zeros((), jnp.int32))
+        buffer = lambda x: jnp.zeros((count, *x.shape), x.dtype).at[0].set(x)
+        frames, clear = jax.tree.map(buffer, (robots.feed.frame, robots.feed.clear))
+    return _Collection(robots, frames, jnp.zeros((), jnp.int32), clear)
 
 
 def _store_frame(collection: _Collection) -> _Collection:
     """Store a fresh frame in the buffer; one after the last step belongs to the next horizon."""
-    feed, frames = collection.robots.feed, collection.frames
-    if feed is None or frames is None:
+    feed = collection.robots.feed
+    if feed is None:
         return collection
     index = collection.frame_index + feed.fresh.astype(jnp.int32)
-    add = lambda: frames.at[index].set(feed.frame, mode="drop")
-    return collection.replace(
-        frames=jax.lax.cond(feed.fresh, add, lambda: frames), frame_index=index
-    )
+    stored, fresh = (collection.frames, collection.clear), (feed.frame, feed.clear)
+    put = lambda old, new: old.at[index].set(new, mode="drop")
+    add = lambda: jax.tree.map(put, stored, fresh)
+    frames, clear = jax.lax.cond(feed.fresh, add, lambda: stored)
+    return collection.replace(frames=frames, frame_index=index, clear=clear)
 
 
 def _to_rollout(
@@ -346,18 +353,20 @@ def _to_rollout(
     nets: Modules,
     train: ppo.TrainState,
     memory: Memory,
-    frames: Float16[Array, "K E rows columns pixels"] | None,
+    collection: _Collection,
     steps: _Step,
 ) -> ppo.Rollout:
     """Assemble the rollout that the update takes from a horizon's steps."""
     value = lambda s: nets.critic.apply(
         train.params.critic, ppo.normalize(train.statistics.critic_obs, s)
     )
-    outcome, sight = steps.outcome, steps.observation.heights
+    outcome, frames = steps.outcome, collection.frames
+    sight = guide = steps.observation.heights
     if frames is not None and steps.frame_valid is not None:
         index = jnp.broadcast_to(steps.frame_index[:, None], steps.frame_valid.shape)
         hold = depth.longest_hold(c.camera, c.physics.control_period)
         sight = network.DepthInput(frames, index, steps.frame_valid, hold)
+        guide = guide if collection.clear is None else sight.replace(frames=collection.clear)
     return ppo.Rollout(
         obs=steps.observation.proprioception,
         critic_obs=steps.observation.privileged,
@@ -375,5 +384,5 @@ def _to_rollout(
         carry=memory.carry,
         sight=sight,
         twin=memory.twin and memory.twin.carry,
-        guide=None if memory.teacher is None else steps.observation.heights,
+        guide=None if memory.teacher is None else guide,
     )

@@ -12,9 +12,17 @@ import tiny_policy
 from tiny_policy import SMALL
 
 from cref_jax import config, ppo
+from cref_jax.env import environment
 from cref_jax.errors import ConfigError
 from cref_jax.policy import sources, warm_start
-from cref_jax.training import imitation, iteration, randomization_ramp, resumption, rollout
+from cref_jax.training import (
+    camera_feed,
+    imitation,
+    iteration,
+    randomization_ramp,
+    resumption,
+    rollout,
+)
 from cref_jax.training.checkpoint import Checkpoints
 from cref_jax.training.imitation import Teacher
 
@@ -30,9 +38,8 @@ def settings(*teachers: str, **ppo_settings: float) -> config.Config:
     return dataclasses.replace(config.override(small_world.C, changes), network=SMALL)
 
 
-def of(*teachers: str, undisturbed: float = 0.0) -> config.Config:
-    randomisation = {"randomisation": {"undisturbed": undisturbed}}
-    return config.override(settings(*teachers), randomisation)
+def of(*teachers: str, **randomisation: float | bool) -> config.Config:
+    return config.override(settings(*teachers), {"randomisation": randomisation})
 
 
 def test_lanes_are_numbered_by_teacher_and_the_rest_is_the_first_ones(world):
@@ -55,30 +62,110 @@ def test_robots_with_nothing_randomised_have_a_teacher_of_their_own(world):
     slope, flat = (world.lanes.kinds.index(kind) for kind in ("slope", "flat"))
     assert disturbed[slope].tolist() == [2, 2, 2] and disturbed[flat].tolist() == [0, 0, 0]
     assert undisturbed[slope].tolist() == [2, 1, 1] and undisturbed[flat].tolist() == [0, 1, 1]
-    numbers = imitation.number_robots(c, world.lanes, E)
-    chosen = randomization_ramp.deal_parts(c.randomisation, world.lanes, E).undisturbed
-    assert 0 < chosen.sum() < E
-    for robot, apart in enumerate(chosen):
+
+
+def test_a_kind_of_undisturbed_lane_goes_before_all_of_them(world):
+    c = of("undisturbed=a", "undisturbed/gap:1=b", "slope=c", undisturbed=0.5)
+    disturbed, undisturbed = imitation.number_lanes(c, world.lanes)
+    gap, slope = (world.lanes.kinds.index(kind) for kind in ("gap", "slope"))
+    assert undisturbed[gap].tolist() == [1, 2, 1] and undisturbed[slope].tolist() == [1, 1, 1]
+    assert disturbed[gap].tolist() == [0, 0, 0] and disturbed[slope].tolist() == [3, 3, 3]
+
+
+def test_who_is_pushed_alone_has_both_teachers_and_the_others_have_one(world):
+    c = of("undisturbed=a", "slope=b", undisturbed=0.3, pushed_alone=0.3)
+    robots = 5 * len(world.lanes.turns)
+    parts = randomization_ramp.deal_parts(c.randomisation, world.lanes, robots)
+    numbers = imitation.number_robots(c, world.lanes, robots)
+    by_lane = imitation.number_lanes(c, world.lanes)
+    assert parts.undisturbed.any() and parts.pushed_alone.any()
+    for robot in range(robots):
         kind = world.lanes.kind_of(np.array([robot]))[0]
-        assert numbers[robot].tolist() == (undisturbed if apart else disturbed)[kind].tolist()
+        has = not parts.undisturbed[robot], parts.undisturbed[robot] | parts.pushed_alone[robot]
+        for group, asked in enumerate(has):
+            expected = by_lane[group, kind].tolist() if asked else [-2, -2, -2]
+            assert numbers[group, robot].tolist() == expected
 
 
-def test_lanes_can_have_no_teacher(taught):
-    world, state = taught
-    world = world.replace(config=settings("slope=none", "gap=other"))
-    assert imitation.list_teachers(world.config.distillation) == ["other"]
+def test_time_since_a_push_worked_by_hand():
+    begins = jnp.array([[0, 1], [0, 0], [0, 0], [1, 0]], bool)
+    pushed = jnp.array([[1, 0], [0, 1], [0, 0], [0, 0]], bool)
+    since, before = imitation._count_since_push(jnp.array([7, 9]), begins, pushed)
+    never = imitation._LONG_AGO
+    assert before.T.tolist() == [[7, 0, 1, never], [never, never + 1, 0, 1]]
+    assert since.tolist() == [never + 1, 2]
+
+
+def test_a_push_brings_the_other_teacher_for_a_while(taught, collected, monkeypatch):
+    (world, state), (nets, seen, trace) = taught, collected
+    c = of("undisturbed=other", pushed_alone=1.0)
+    monkeypatch.setattr(imitation, "AFTER_PUSH", 2 * c.physics.control_period)
+    world = world.replace(config=c)
+    seen = seen._replace(begins=jnp.zeros_like(seen.begins))
+    pushed = jnp.zeros((T, E), bool).at[0].set(True)
+    memory, target, _ = imitation.ask_teachers(
+        world,
+        nets.actor,
+        state.teachers,
+        state.robots.memory.teacher,
+        seen,
+        trace.measures._replace(pushed=pushed),
+    )
+    said = [
+        nets.actor.apply(
+            teacher.actor,
+            state.robots.memory.carry,
+            ppo.normalize(teacher.obs, seen.obs),
+            seen.begins,
+            seen.sight,
+        )
+        for teacher in state.teachers
+    ]
+    for step, number in enumerate((1, 0, 0, 1)):
+        np.testing.assert_allclose(target[step], said[number][1].mean[step], atol=1e-5)
+    for kept, (carry, _) in zip(memory[:2], said, strict=True):
+        np.testing.assert_allclose(kept.gru, carry.gru, atol=1e-5)
+    np.testing.assert_array_equal(memory.since_push, np.full(E, T - 1))
+
+
+def test_teachers_can_sense_the_truth():
+    faults = {"enabled": True, "depth_noise": 0.05, "depth_dead": 0.3}
+    c = config.override(of(**faults), {"distillation": {"true_senses": True}})
+    world = small_world.world().replace(config=c)
+    state = jax.jit(iteration.initial_state)(world)
     nets = rollout.networks(SMALL, world.physics.robot.num_joints)
     keys = jax.random.split(jax.random.key(1), E)
-    _, seen, trace = jax.jit(lambda r: rollout.collect(world, nets, state.train, r, keys))(
-        state.robots
+    own = Teacher(state.train.params.actor, state.train.statistics.obs)
+    collect = jax.jit(lambda r: rollout.collect(world, nets, state.train, r, keys))
+    robots, seen, trace = collect(state.robots)
+    _, target, _ = imitation.ask_teachers(
+        world, nets.actor, (own,), state.robots.memory.teacher, seen, trace.measures
     )
+    exact = seen.critic_obs[..., : seen.obs.shape[-1]]
+    assert float(jnp.abs(exact - seen.obs).max()) > 0.1  # joint velocities are noisy
+    assert float(jnp.abs(seen.guide.frames - seen.sight.frames).max()) > 0.01
+    _, said = nets.actor.apply(
+        own.actor, seen.carry, ppo.normalize(own.obs, exact), seen.begins, seen.guide
+    )
+    np.testing.assert_allclose(target, said.mean, atol=1e-5)
+    no_faults = world.replace(config=config.override(c, {"randomisation": {"enabled": False}}))
+    look = jax.jit(camera_feed.render_frames)
+    both = camera_feed._render_all(world, robots.env, environment.depth_images)
+    for image, there in zip(both, (world, no_faults), strict=True):
+        np.testing.assert_allclose(image, look(there, robots.env), atol=1e-3)  # of 16 bits
+
+
+def test_lanes_can_have_no_teacher(taught, collected):
+    (world, state), (nets, seen, trace) = taught, collected
+    world = world.replace(config=settings("slope=none", "gap=other"))
+    assert imitation.list_teachers(world.config.distillation) == ["other"]
     _, target, apart = imitation.ask_teachers(
         world,
         nets.actor,
         state.teachers,
         state.robots.memory.teacher,
         seen,
-        trace.measures.level,
+        trace.measures,
     )
     slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
     for said in (target[..., 0], apart):
@@ -89,6 +176,8 @@ def test_lanes_can_have_no_teacher(taught):
     ("teachers", "says"),
     [
         (("undisturbed=a",), "'undisturbed' needs --randomisation.undisturbed above 0"),
+        (("undisturbed/gap=a",), "'undisturbed/gap' needs --randomisation.undisturbed above 0"),
+        (("disturbed/gap=a",), "unknown kind of lane 'disturbed/gap'"),
         (("flat",), "'flat' is not KIND=POLICY or KIND:FIRST-LAST=POLICY"),
         (("=a",), "'=a' is not KIND=POLICY"),
         (("flat:=a",), "'flat:=a' is not KIND=POLICY"),
@@ -114,6 +203,17 @@ def taught():
     return world, state.replace(teachers=(first, second))
 
 
+@pytest.fixture(scope="module")
+def collected(taught):
+    """The networks of that run, its first rollout and what was measured in it."""
+    world, state = taught
+    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
+    keys = jax.random.split(jax.random.key(1), E)
+    collect = jax.jit(lambda robots: rollout.collect(world, nets, state.train, robots, keys))
+    _, seen, trace = collect(state.robots)
+    return nets, seen, trace
+
+
 def policies():
     first = tiny_policy.policy("full")
     actor = jax.tree.map(lambda x: 0.8 * x - 0.01, first.train.params.actor)
@@ -127,12 +227,12 @@ def test_each_teacher_says_what_it_would_do_on_its_own_lanes_and_remembers(taugh
     slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
     assert slopes.sum() == E // len(world.lanes.turns)
     robots, memory = state.robots, state.robots.memory.teacher
-    alone = [memory, memory]
+    alone = [memory.disturbed, memory.disturbed]
     collect = jax.jit(lambda robots, keys: rollout.collect(world, nets, state.train, robots, keys))
     ask = jax.jit(lambda *a: imitation.ask_teachers(world, nets.actor, state.teachers, *a))
     for seed in (1, 2):
         robots, seen, trace = collect(robots, jax.random.split(jax.random.key(seed), E))
-        memory, target, apart = ask(memory, seen, trace.measures.level)
+        memory, target, apart = ask(memory, seen, trace.measures)
         for number, teacher in enumerate(state.teachers):
             obs = ppo.normalize(teacher.obs, seen.obs)
             alone[number], said = nets.actor.apply(
@@ -141,43 +241,37 @@ def test_each_teacher_says_what_it_would_do_on_its_own_lanes_and_remembers(taugh
             own = slopes if number else ~slopes
             np.testing.assert_allclose(target[:, own], said.mean[:, own], atol=1e-5)
             assert np.abs(target[:, ~own] - said.mean[:, ~own]).max() > 0.01
-            np.testing.assert_allclose(memory.gru[own], alone[number].gru[own], atol=1e-5)
+            np.testing.assert_allclose(memory.disturbed.gru[own], alone[number].gru[own], atol=1e-5)
         # sum over joints of (m - m')^2 / (2 s^2)
         shift = (target - seen.mean) * np.exp(-seen.log_std)
         np.testing.assert_allclose(apart, 0.5 * np.square(shift).sum(axis=-1), rtol=1e-4)
 
 
 @pytest.mark.parametrize("levels", [(0, 1), (1, 0)])
-def test_a_new_episode_on_another_level_has_that_levels_teacher(taught, levels):
-    world, state = taught
+def test_a_new_episode_on_another_level_has_that_levels_teacher(taught, collected, levels):
+    (world, state), (nets, seen, trace) = taught, collected
     world = world.replace(config=settings("slope:1=other"))
-    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
-    keys = jax.random.split(jax.random.key(1), E)
-    _, seen, _ = jax.jit(lambda r: rollout.collect(world, nets, state.train, r, keys))(state.robots)
     seen = seen._replace(begins=seen.begins.at[:].set(False).at[2].set(True))
     level = jnp.repeat(jnp.array(levels), 2)[:, None] * jnp.ones((T, E), int)
-    begun = jax.tree.map(lambda x: x + 0.5, state.robots.memory.teacher)
+    carry = jax.tree.map(lambda x: x + 0.5, state.robots.memory.carry)
+    begun = state.robots.memory.teacher._replace(disturbed=carry)
     memory, target, _ = imitation.ask_teachers(
-        world, nets.actor, state.teachers, begun, seen, level
+        world, nets.actor, state.teachers, begun, seen, trace.measures._replace(level=level)
     )
     slopes = world.lanes.kind_of(np.arange(E)) == world.lanes.kinds.index("slope")
     for steps, number in zip((slice(0, 2), slice(2, 4)), levels, strict=True):
         teacher = state.teachers[number]
         obs = ppo.normalize(teacher.obs, seen.obs)
-        carry, said = nets.actor.apply(teacher.actor, begun, obs, seen.begins, seen.sight)
+        carry, said = nets.actor.apply(teacher.actor, begun.disturbed, obs, seen.begins, seen.sight)
         np.testing.assert_allclose(target[steps, slopes], said.mean[steps, slopes], atol=1e-5)
-    np.testing.assert_allclose(memory.gru[slopes], carry.gru[slopes], atol=1e-5)
+    np.testing.assert_allclose(memory.disturbed.gru[slopes], carry.gru[slopes], atol=1e-5)
 
 
-def test_who_learns_from_itself_is_where_it_should_be(taught):
-    world, state = taught
+def test_who_learns_from_itself_is_where_it_should_be(taught, collected):
+    (world, state), (nets, seen, trace) = taught, collected
     own = Teacher(state.train.params.actor, state.train.statistics.obs)
-    nets = rollout.networks(SMALL, world.physics.robot.num_joints)
-    keys = jax.random.split(jax.random.key(1), E)
-    collect = jax.jit(lambda robots: rollout.collect(world, nets, state.train, robots, keys))
-    _, seen, trace = collect(state.robots)
     *_, apart = imitation.ask_teachers(
-        world, nets.actor, (own, own), state.robots.memory.teacher, seen, trace.measures.level
+        world, nets.actor, (own, own), state.robots.memory.teacher, seen, trace.measures
     )
     assert float(jnp.abs(apart).max()) < 1e-6
 

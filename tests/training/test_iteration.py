@@ -53,7 +53,7 @@ def test_the_log_of_three_robots_over_two_steps_worked_by_hand():
     measures = environment.Measures(
         terms={}, speed_error=no + 0.2, forward_speed=no + 0.4, forward_command=no + 0.6,
         airborne=touchdown, touchdown=touchdown, foothold_distance=distance, progress=no + 1.0,
-        commanded=no + 1.0, steps=np.array([[50, 99, 7], [1, 100, 8]]),
+        commanded=no + 1.0, steps=np.array([[50, 99, 7], [1, 100, 8]]), pushed=no,
         kind=np.tile([0, 1, 1], (2, 1)), level=no + 0, rank=np.array([[4, 5, 8], [3, 6, 8]]),
     )  # fmt: skip
     trace = rollout.Trace(
