@@ -29,7 +29,9 @@ from cref_jax.training.rollout import Robots
 
 UNDISTURBED = "undisturbed"  # before a kind, or in its place: robots with nothing randomised
 NOBODY = "none"  # in place of a policy: these robots learn by PPO alone
-AFTER_PUSH = 3.0  # s for which who is pushed alone has the disturbed robots' teacher; assumed
+AFTER_PUSH = 1.0
+"""s for which who is pushed alone has the disturbed robots' teacher. A policy that handed over to
+`robust` for 0.5, 1, 2 and 4 s fell as seldom from 1 s on, and it can only remember what shows"""
 _UNSAID, _ALONE = -1, -2  # in place of a teacher's number
 _LONG_AGO = 2**20  # control steps since a push that never was
 
