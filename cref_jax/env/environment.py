@@ -48,7 +48,7 @@ class Measures(NamedTuple):
     progress: Float[Array, ""]  # m from the start along the lane
     commanded: Float[Array, ""]  # m asked for
     steps: Int[Array, ""]  # control steps in the episode, this one included
-    pushed: Bool[Array, ""]  # at the beginning of this step
+    pushed: Bool[Array, ""]  # a push was due at the beginning of this step
     kind: Int[Array, ""]
     level: Int[Array, ""]
     rank: Int[Array, ""]

@@ -41,8 +41,9 @@ def check_teachers(c: Config, init: Path | None, resumes: bool) -> None:
     """
     names = imitation.list_teachers(c.distillation)
     if not c.ppo.imitation_weight:
-        if names:
-            raise ConfigError("--distillation.teachers: --ppo.imitation-weight must be above 0")
+        needs = {"teachers": bool(names), "true-senses": c.distillation.true_senses}
+        for option in (name for name, is_set in needs.items() if is_set):
+            raise ConfigError(f"--distillation.{option}: --ppo.imitation-weight must be above 0")
         return
     if c.network.variant in HPL:
         raise ConfigError(

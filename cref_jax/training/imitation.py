@@ -4,7 +4,7 @@ The student acts, and each teacher says what it would do in the states that are 
 (DAgger, Ross et al. 2011); how far the student is from that is one more loss of PPO (kickstarting,
 arXiv 1803.03835). Lanes that no other teacher has are the first one's: the policy that the run
 begins as. Robots for which nothing is randomised may have another, and lanes none at all. Robots
-that are only pushed have that other one as well, but not in the seconds after a push: until it
+that are only pushed have that other one as well, but not in the second after a push: until it
 comes, nothing tells them from robots that are left alone.
 """
 
@@ -30,8 +30,8 @@ from cref_jax.training.rollout import Robots
 UNDISTURBED = "undisturbed"  # before a kind, or in its place: robots with nothing randomised
 NOBODY = "none"  # in place of a policy: these robots learn by PPO alone
 AFTER_PUSH = 1.0
-"""s for which who is pushed alone has the disturbed robots' teacher. A policy that handed over to
-`robust` for 0.5, 1, 2 and 4 s fell as seldom from 1 s on, and it can only remember what shows"""
+"""s for which a robot that is only pushed has the disturbed robots' teacher: a policy that hands
+over to `robust` for longer after a push falls as often"""
 _UNSAID, _ALONE = -1, -2  # in place of a teacher's number
 _LONG_AGO = 2**20  # control steps since a push that never was
 
@@ -123,7 +123,8 @@ def _find_lanes(
     has_calm = c.randomisation.undisturbed > 0.0 or c.randomisation.pushed_alone > 0.0
     if UNDISTURBED in (who, group) and not has_calm:
         raise ConfigError(
-            f"--distillation.teachers: '{who}' needs --randomisation.undisturbed above 0"
+            f"--distillation.teachers: '{who}' needs --randomisation.undisturbed or "
+            "--randomisation.pushed-alone above 0"
         )
     if who == UNDISTURBED:
         return numbers[2]

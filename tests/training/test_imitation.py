@@ -155,6 +155,12 @@ def test_teachers_can_sense_the_truth():
         np.testing.assert_allclose(image, look(there, robots.env), atol=1e-3)  # of 16 bits
 
 
+def test_true_senses_without_teachers_are_refused():
+    c = config.override(settings(imitation_weight=0.0), {"distillation": {"true_senses": True}})
+    with pytest.raises(ConfigError, match=r"true-senses: --ppo.imitation-weight must be above 0"):
+        warm_start.check_teachers(c, None, resumes=False)
+
+
 def test_lanes_can_have_no_teacher(taught, collected):
     (world, state), (nets, seen, trace) = taught, collected
     world = world.replace(config=settings("slope=none", "gap=other"))
@@ -175,8 +181,8 @@ def test_lanes_can_have_no_teacher(taught, collected):
 @pytest.mark.parametrize(
     ("teachers", "says"),
     [
-        (("undisturbed=a",), "'undisturbed' needs --randomisation.undisturbed above 0"),
-        (("undisturbed/gap=a",), "'undisturbed/gap' needs --randomisation.undisturbed above 0"),
+        (("undisturbed=a",), "'undisturbed' needs --randomisation.undisturbed or"),
+        (("undisturbed/gap=a",), "'undisturbed/gap' needs --randomisation.undisturbed or"),
         (("disturbed/gap=a",), "unknown kind of lane 'disturbed/gap'"),
         (("flat",), "'flat' is not KIND=POLICY or KIND:FIRST-LAST=POLICY"),
         (("=a",), "'=a' is not KIND=POLICY"),
