@@ -41,9 +41,10 @@ def check_teachers(c: Config, init: Path | None, resumes: bool) -> None:
     """
     names = imitation.list_teachers(c.distillation)
     if not c.ppo.imitation_weight:
-        needs = {"teachers": bool(names), "true-senses": c.distillation.true_senses}
-        for option in (name for name, is_set in needs.items() if is_set):
-            raise ConfigError(f"--distillation.{option}: --ppo.imitation-weight must be above 0")
+        if names:
+            raise ConfigError("--distillation.teachers: --ppo.imitation-weight must be above 0")
+        if c.distillation.true_senses:
+            raise ConfigError("--distillation.true-senses: --ppo.imitation-weight must be above 0")
         return
     if c.network.variant in HPL:
         raise ConfigError(

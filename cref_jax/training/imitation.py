@@ -120,8 +120,8 @@ def _find_lanes(
     if who != UNDISTURBED and not is_known:
         unknown = describe_unknown("kind of lane", who, [*lanes.kinds, UNDISTURBED])
         raise ConfigError(f"--distillation.teachers: {unknown}")
-    has_calm = c.randomisation.undisturbed > 0.0 or c.randomisation.pushed_alone > 0.0
-    if UNDISTURBED in (who, group) and not has_calm:
+    has_undisturbed = c.randomisation.undisturbed > 0.0 or c.randomisation.pushed_alone > 0.0
+    if UNDISTURBED in (who, group) and not has_undisturbed:
         raise ConfigError(
             f"--distillation.teachers: '{who}' needs --randomisation.undisturbed or "
             "--randomisation.pushed-alone above 0"
@@ -179,8 +179,8 @@ def ask_teachers(
     undisturbed, target_undisturbed = ask(numbers[1], memory.undisturbed)
     since, before = _count_since_push(memory.since_push, rollout.begins, measures.pushed)
     parts = randomization_ramp.deal_parts(c.randomisation, world.lanes, num_envs)
-    is_calm = before >= round(AFTER_PUSH / c.physics.control_period)
-    is_undisturbed = parts.undisturbed | (parts.pushed_alone & is_calm)
+    is_recent = before < round(AFTER_PUSH / c.physics.control_period)
+    is_undisturbed = parts.undisturbed | (parts.pushed_alone & ~is_recent)
     target = jnp.where(is_undisturbed[..., None], target_undisturbed, target)
     apart = gaussian.kl_of_means(target, clean.mean, rollout.log_std[0, 0])
     return TeacherMemory(disturbed, undisturbed, since), target, apart
