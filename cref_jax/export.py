@@ -21,7 +21,7 @@ class Options(cli.PolicyOptions):
     run: Path | None = None
     """runs/NAME, or a file that --learner wrote (default: the newest run)"""
     policy: Path | None = None
-    """an exported policy, or `mixed` or `robust`, to write again with this version's runtime"""
+    """an exported policy, or a bundled one by name, to write again with this version's runtime"""
     out: Path = Path("policy")
     """directory to write; a .zip of the same name is written beside it"""
     learner: Path | None = None

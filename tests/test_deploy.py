@@ -327,7 +327,7 @@ def image_by_the_manifests_words(depth, words, max_invalid):
     return np.float16(nearest / far - 0.5)
 
 
-@pytest.mark.parametrize("name", ["mixed", "robust"])
+@pytest.mark.parametrize("name", ["combined", "mixed", "robust"])
 def test_the_manifest_says_all_that_is_done_to_a_frame(name):
     rng, manifest = np.random.default_rng(4), deploy.contents(bundled_policy(name))[0]
     depth_image = rng.uniform(0.3, 4.0, (48, 64)).astype(np.float32)

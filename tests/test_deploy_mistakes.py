@@ -10,7 +10,7 @@ from cref_jax.config import folders
 from cref_jax.deploy import Status
 from cref_jax.runtime.status import WHY
 
-POLICIES = [folders.data_folder("policies") / name for name in ("mixed", "robust")]
+POLICIES = [folders.data_folder("policies") / name for name in ("combined", "mixed", "robust")]
 
 
 def ground(height=0.95, pitch=50.0):

@@ -28,7 +28,7 @@ def said(capsys, *arguments):
         (["--run", "a", "--policy", "b"], "give --run or --policy, not both"),
         (["--suite", "ood", "--policy", "a", "b"], "--suite ood takes one run or policy, not 2"),
         (["--film", "curbs"], "--film takes a scene of --suite ood"),
-        (["--policy", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
+        (["--policy", "nowhere"], "no run or policy nowhere; bundled are combined, mixed, robust"),
     ],
 )
 def test_what_cannot_be_judged_is_one_line(capsys, arguments, message):

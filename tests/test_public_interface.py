@@ -24,7 +24,7 @@ SETTINGS = {
     "foothold": "Foothold", "network": "Network", "ppo": "PPO",
     "distillation": "Distillation",
 }  # fmt: skip
-POLICIES = ("mixed", "robust")
+POLICIES = ("combined", "mixed", "robust")
 
 
 @pytest.fixture(scope="module")

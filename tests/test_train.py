@@ -282,7 +282,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
         ),
         (["--robot", "g2"], "unknown robot 'g2'; known: g1, x2_ultra"),
         (["--robot", "g1", "--init", BUNDLED], "is of the robot 'x2_ultra', not of 'g1'"),
-        (["--init", "nowhere"], "there is no run or policy nowhere; bundled are mixed, robust"),
+        (["--init", "nowhere"], "no run or policy nowhere; bundled are combined, mixed, robust"),
         (
             ["--terrain", "gap", "--init", BUNDLED, "--network.gru", "9"],
             "has another network: ",
@@ -293,7 +293,7 @@ def state_of(folder: Path) -> list[np.ndarray]:
         ),
         (
             ["--terrain=gap", "--init", BUNDLED, "--ppo.imitation-weight=1", f"{TEACHERS}=gap=b"],
-            "there is no run or policy b; bundled are mixed, robust",
+            "no run or policy b; bundled are combined, mixed, robust",
         ),
     ],
 )

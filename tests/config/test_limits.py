@@ -126,7 +126,7 @@ def test_all_presets_and_experiments_are_within(device, experiment):
             limits.check(presets.build_config(terrain, experiment, device))
 
 
-@pytest.mark.parametrize("name", ["mixed", "robust"])
+@pytest.mark.parametrize("name", ["combined", "mixed", "robust"])
 def test_the_bundled_policies_are_within(name):
     limits.check(sources.read_config(sources.bundled_policy(name)))
 

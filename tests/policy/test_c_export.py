@@ -44,7 +44,7 @@ def programs(tmp_path_factory):
 
     @functools.cache
     def program(name):
-        bundled = name in ("mixed", "robust")
+        bundled = name in ("combined", "mixed", "robust")
         made = {"overlapping": lambda: tiny("full", OVERLAPPING)}.get(name, lambda: tiny(name))
         source = deploy.contents(sources.bundled_policy(name)) if bundled else made()
         return build(write(*source, folder / name))
@@ -53,7 +53,7 @@ def programs(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mixed", "robust"])
+@pytest.mark.parametrize("name", ["combined", "mixed", "robust"])
 def test_a_bundled_policy_says_in_c_what_it_said_in_training(name, programs, monkeypatch):
     path = sources.bundled_policy(name)
     vectors, calls = np.load(path / "testvectors.npz"), Calls(J)
@@ -171,7 +171,7 @@ def of_frames() -> Status:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mixed", "robust"])
+@pytest.mark.parametrize("name", ["combined", "mixed", "robust"])
 def test_a_bundled_policy_bears_faults_in_c_as_in_numpy(name, programs, monkeypatch):
     leave_out_cross_checks(monkeypatch)
     source = deploy.contents(sources.bundled_policy(name))

@@ -275,6 +275,6 @@ def test_a_bundled_policy_is_found_by_its_name_where_there_is_no_such_file(tmp_p
     assert sources.find_policy(Path("robust")) == Path("robust")
 
 
-@pytest.mark.parametrize("name", ["mixed", "robust"])  # one with a ray per pixel, one with windows
+@pytest.mark.parametrize("name", ["combined", "mixed", "robust"])  # one has a ray per pixel
 def test_a_bundled_policy_says_what_it_said_in_training(name):
     deploy.self_test(sources.bundled_policy(name))
