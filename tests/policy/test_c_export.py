@@ -170,8 +170,8 @@ def of_frames() -> Status:
     return Status(sum(flag for flag in Status if re.search("DEPTH|SEES|CAMERA", str(flag.name))))
 
 
-# not `combined`: its guards are those of `robust`, but after 2,100 calls rounding in the memory
-# puts the targets of C and numpy 1.4e-4 rad apart, more than the 1e-4 that is allowed here
+# not `combined`: its guards are those of `robust`, but after 2,100 calls the targets of C and numpy
+# are 1.4e-4 rad apart, more than the 1e-4 that is allowed here; why is not known
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["mixed", "robust"])
 def test_a_bundled_policy_bears_faults_in_c_as_in_numpy(name, programs, monkeypatch):
