@@ -5,7 +5,7 @@ Parameters come from `kind_files`, shapes from `generators`; a user's height map
 
 import dataclasses
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,8 @@ def build(c: config.Terrain) -> Atlas:
     numbers = {kind: n._replace(shape=n.practice) for kind, n in numbers.items()}
     sizes = np.stack([np.linspace(*n.train, c.levels) for n in numbers.values()], axis=1)
     seeds = [c.seed + variant for variant in range(c.variants)] * c.levels
-    atlas = _build_atlas(c, numbers, np.repeat(sizes, c.variants, axis=0), seeds, c.slits)
+    slits = _assign_slits(c, numbers)
+    atlas = _build_atlas(c, numbers, np.repeat(sizes, c.variants, axis=0), seeds, slits)
     return atlas.replace(
         sizes=sizes, turns=kind_files.round_robin_kinds(c.name, atlas.kinds), variants=c.variants
     )
@@ -78,20 +79,29 @@ def named_sizes(c: config.Terrain, kind: str) -> dict[str, float]:
     return dataclasses.asdict(levels) if levels else {}
 
 
+def _assign_slits(c: config.Terrain, kinds: Iterable[str]) -> dict[str, float]:
+    """Assign each kind of lane its widest slits, m."""
+    for kind in c.slit_kinds:
+        if kind not in KINDS:
+            unknown = config.describe_unknown("kind", kind, list(KINDS))
+            raise ConfigError(f"--terrain.slit-kinds: {unknown}")
+    return {kind: c.slits for kind in c.slit_kinds or kinds}
+
+
 def _build_atlas(
     c: config.Terrain,
     numbers: dict[str, KindNumbers],
     sizes: np.ndarray,
     seeds: list[int],
-    slits: float = 0.0,
+    slits: Mapping[str, float] | None = None,
 ) -> Atlas:
-    """Build the lanes of each kind at its sizes [levels, kinds] and seeds; `slits` in m."""
+    """Build the lanes of each kind at its sizes [levels, kinds] and seeds; its `slits` in m."""
     size = columns(c.lane_length, c), columns(c.lane_width, c)
     stored, places, is_profile = [], [], []
     for k, (kind, n) in enumerate(numbers.items()):
         atlas.check_columns((size[0] * len(seeds), size[1]), f"'{kind}' of terrain '{c.name}'")
         drawn = [
-            _generate_lane(c, n.shape, kind, float(sizes[row, k]), s, slits)
+            _generate_lane(c, n.shape, kind, float(sizes[row, k]), s, (slits or {}).get(kind, 0.0))
             for row, s in enumerate(seeds)
         ]
         level_across = all((lane == lane[:, :1]).all() for lane in drawn)

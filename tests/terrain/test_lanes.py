@@ -460,6 +460,23 @@ def test_half_of_the_lanes_of_training_have_slits_where_the_ground_is_level():
     assert 14 < with_slits < 34  # of 48
 
 
+def test_kinds_that_may_not_have_slits_have_none():
+    c = config.Terrain(name="mixed", variants=4, slits=0.04, slit_kinds=("stairs_up", "flat"))
+    plain, cut = (lanes.build(dataclasses.replace(c, slits=s)) for s in (0.0, 0.04))
+    changed = {
+        kind
+        for k, kind in enumerate(cut.kinds)
+        for variant in range(4)
+        if not np.array_equal(*(a.tile(5, k, variant).heights for a in (plain, cut)))
+    }
+    assert changed == {"stairs_up", "flat"}
+
+
+def test_slits_of_an_unknown_kind_are_refused():
+    c = config.Terrain(name="mixed", slits=0.04, slit_kinds=("stair_up",))
+    refused("did you mean 'stairs_up'", lanes.build, c)
+
+
 def test_slits_are_of_training_alone():
     a, b = (lanes.build_single(config.Terrain(slits=s), "gap", 0.5) for s in (0.0, 0.04))
     np.testing.assert_array_equal(profile(a), profile(b))
