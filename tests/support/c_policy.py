@@ -96,7 +96,9 @@ class Both:
     """A policy in numpy that does not compare the senses, and a record of its calls for C."""
 
     def __init__(self, manifest, arrays, calls: Calls, which: int = 0, at_once: bool = False):
-        self._numpy = deploy.Policy(manifest, arrays)
+        self._numpy, self._near = (deploy.Policy(manifest, arrays) for _ in range(2))
+        self.sensitivity = 0.0
+        """rad by which a target has changed at most if each joint is at the next float"""
         self._calls, self._which, self._at_once = calls, which, at_once
         self.joints, self.blind = self._numpy.joints, self._numpy.blind
         self.reset()
@@ -106,27 +108,34 @@ class Both:
 
     def reset(self) -> None:
         """Reset; in C all is as if the policy were new."""
-        self._numpy.reset()
-        self._numpy._senses.q[:] = self.joints.default
-        self._numpy._actor._known[:] = 0.0
+        for policy in (self._numpy, self._near):
+            policy.reset()
+            policy._senses.q[:] = self.joints.default
+            policy._actor._known[:] = 0.0
+            policy._begun = policy._begun or self._at_once
         self._add("reset")
         if self._at_once:
-            self._numpy._begun = True
             self._add("begin_at_once")
 
     def stop(self) -> None:
         self._numpy.stop()
+        self._near.stop()
         self._add("stop")
 
     def on_depth(self, depth, stamp: float) -> int:
         """Give a frame; return the status of numpy's."""
         self._add("on_depth", depth, times=(stamp,))
-        return int(self._numpy.on_depth(np.asarray(depth, np.float32), stamp))
+        depth = np.asarray(depth, np.float32)
+        self._near.on_depth(depth, stamp)
+        return int(self._numpy.on_depth(depth, stamp))
 
     def step(self, *inputs, now: float, commanded: float) -> tuple[int, np.ndarray, np.ndarray]:
         """Step; return status, target and velocity of numpy's."""
         self._add("step", *inputs, times=(now, commanded))
-        target = self._numpy.step(*(np.asarray(x, np.float32) for x in inputs), now, commanded)
+        *others, q, qd = (np.asarray(x, np.float32) for x in inputs)
+        target = self._numpy.step(*others, q, qd, now, commanded)
+        near = self._near.step(*others, np.nextafter(q, np.float32(np.inf)), qd, now, commanded)
+        self.sensitivity = max(self.sensitivity, float(np.abs(near - target).max()))
         return int(self._numpy.status), target, self._numpy.tensors()["velocity"]
 
     @property
