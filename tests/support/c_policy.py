@@ -95,10 +95,20 @@ class Calls:
 class Both:
     """A policy in numpy that does not compare the senses, and a record of its calls for C."""
 
-    def __init__(self, manifest, arrays, calls: Calls, which: int = 0, at_once: bool = False):
-        self._numpy, self._near = (deploy.Policy(manifest, arrays) for _ in range(2))
+    def __init__(
+        self,
+        manifest,
+        arrays,
+        calls: Calls,
+        which: int = 0,
+        at_once: bool = False,
+        near: bool = False,
+    ):
+        self._numpy = deploy.Policy(manifest, arrays)
+        self._near = deploy.Policy(manifest, arrays) if near else None
         self.sensitivity = 0.0
-        """rad by which a target has changed at most if each joint is at the next float"""
+        """rad by which a target has changed at most where each joint is at the next float; 0 unless
+        `near`"""
         self._calls, self._which, self._at_once = calls, which, at_once
         self.joints, self.blind = self._numpy.joints, self._numpy.blind
         self.reset()
@@ -108,7 +118,7 @@ class Both:
 
     def reset(self) -> None:
         """Reset; in C all is as if the policy were new."""
-        for policy in (self._numpy, self._near):
+        for policy in filter(None, (self._numpy, self._near)):
             policy.reset()
             policy._senses.q[:] = self.joints.default
             policy._actor._known[:] = 0.0
@@ -118,15 +128,16 @@ class Both:
             self._add("begin_at_once")
 
     def stop(self) -> None:
-        self._numpy.stop()
-        self._near.stop()
+        for policy in filter(None, (self._numpy, self._near)):
+            policy.stop()
         self._add("stop")
 
     def on_depth(self, depth, stamp: float) -> int:
         """Give a frame; return the status of numpy's."""
         self._add("on_depth", depth, times=(stamp,))
         depth = np.asarray(depth, np.float32)
-        self._near.on_depth(depth, stamp)
+        if self._near:
+            self._near.on_depth(depth, stamp)
         return int(self._numpy.on_depth(depth, stamp))
 
     def step(self, *inputs, now: float, commanded: float) -> tuple[int, np.ndarray, np.ndarray]:
@@ -134,8 +145,9 @@ class Both:
         self._add("step", *inputs, times=(now, commanded))
         *others, q, qd = (np.asarray(x, np.float32) for x in inputs)
         target = self._numpy.step(*others, q, qd, now, commanded)
-        near = self._near.step(*others, np.nextafter(q, np.float32(np.inf)), qd, now, commanded)
-        self.sensitivity = max(self.sensitivity, float(np.abs(near - target).max()))
+        if self._near:
+            near = self._near.step(*others, np.nextafter(q, np.float32(np.inf)), qd, now, commanded)
+            self.sensitivity = max(self.sensitivity, float(np.abs(near - target).max()))
         return int(self._numpy.status), target, self._numpy.tensors()["velocity"]
 
     @property
