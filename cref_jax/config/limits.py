@@ -99,6 +99,7 @@ RANGES: Ranges = {
         "camera_pitch": Within(0, 90),
         "camera_position": Within(0, 1),
         "structures": Within(0, 1000),
+        "perforations": Within(0, 1),
         "depth_noise": Within(0, 1),
         "depth_scale": Within(0, 0.9),
         "depth_dead": Within(0, 0.9),

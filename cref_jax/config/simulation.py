@@ -48,7 +48,7 @@ class Terrain:
     levels: int = 10  # assumed: as legged_gym
     variants: int = 1  # lanes per level and kind, one drawn at each reset; assumed
     slits: float = 0.0  # m, the widest across half of the lanes, as between planks; 0: none
-    slit_kinds: tuple[str, ...] = ()  # that may have them; empty: all kinds of lane
+    slit_kinds: tuple[str, ...] = ()  # that may have slits or perforations; empty: all
     seed: int = 1  # of the random heights and landings
 
 

@@ -109,6 +109,9 @@ class Randomisation:
     structures: int = 0
     """Capsules per episode in the depth image alone: rails, walls, posts and bars beside and over
     the lane"""
+    perforations: float = 0.0
+    """m, the widest holes that the depth image shows in the ground of half of the episodes, on
+    lanes of terrain.slit_kinds, whatever else is randomised"""
     depth_noise: float = 0.0
     """m, deviation of depth at 1 m, up to; grows with depth squared, as in stereo"""
     depth_scale: float = 0.0  # +-, share by which all depths are wrong

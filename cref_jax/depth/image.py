@@ -50,6 +50,20 @@ def render(
     return jnp.minimum(jnp.minimum(ground, links), camera.d_max)
 
 
+def locate_pixels(
+    metres: Float[Array, "H W"],
+    position: Float[Array, "3"],
+    rotation: Float[Array, "3 3"],
+    camera: config.Camera,
+) -> Float[Array, "H W 3"]:
+    """Compute where in the world the pixels of a depth image lie, m."""
+    height, width = camera.shape
+    x = _pixel_slopes(width, camera.view[1])[None, :] * metres
+    y = _pixel_slopes(height, camera.view[0])[:, None] * metres
+    own = jnp.stack([x, y, metres], axis=-1)
+    return position + jnp.matmul(own, rotation.T, precision=jax.lax.Precision.HIGHEST)
+
+
 def capsules_in_view(links: Links, capsules: robot.Capsules) -> Float[Array, "C 7"]:
     """Compute both ends and the radius of each capsule that the camera may see, m, world."""
     visible = np.flatnonzero(capsules.in_view)

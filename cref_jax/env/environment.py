@@ -20,6 +20,7 @@ from cref_jax.env import (
     footholds,
     gait,
     observations,
+    perforations,
     resets,
     rewards,
     structures,
@@ -235,7 +236,10 @@ def render_depth(
     if with_links and randomisation.enabled and randomisation.structures:
         capsules = jnp.concatenate([capsules, structures.sample_structures(world, state)])
     ground = _ground(world, state)
-    return depth.render(ground, position, rotation, capsules, camera, is_profile)
+    metres = depth.render(ground, position, rotation, capsules, camera, is_profile)
+    if with_links and randomisation.enabled and randomisation.perforations:
+        return perforations.see_through(world, state, metres, position, rotation)
+    return metres
 
 
 def _ground(world: World, state: EnvState) -> terrain.Terrain:
