@@ -1,7 +1,7 @@
 """The depth camera: what it sees of the ground and of the robot's own links, and when."""
 
 from cref_jax.depth.camera import is_due, longest_hold, max_frames, min_filter, normalize, pose
-from cref_jax.depth.image import capsules_in_view, locate_pixels, render
+from cref_jax.depth.image import capsules_in_view, locate_pixels, render, render_capsules
 
 __all__ = [
     "capsules_in_view",
@@ -13,4 +13,5 @@ __all__ = [
     "normalize",
     "pose",
     "render",
+    "render_capsules",
 ]

@@ -37,16 +37,12 @@ def render(
     `is_profile` promises that heights are constant across the lane (along y), as on stairs: the
     image is the same, but faster to render.
     """
-    height, width = camera.shape
-    x, y = (
-        _pixel_slopes(width, camera.view[1])[None, :],
-        _pixel_slopes(height, camera.view[0])[:, None],
-    )
+    x, y = _pixel_rays(camera)
     if is_profile:
         ground = sweep.profile_depth(terrain, position, rotation, x, y, camera)
     else:
         ground = raymarch.ground_depth(terrain, position, rotation, x, y, camera)
-    links = _render_links(position, rotation, capsules, x, y)
+    links = render_capsules(position, rotation, capsules, camera)
     return jnp.minimum(jnp.minimum(ground, links), camera.d_max)
 
 
@@ -55,13 +51,14 @@ def locate_pixels(
     position: Float[Array, "3"],
     rotation: Float[Array, "3 3"],
     camera: config.Camera,
-) -> Float[Array, "H W 3"]:
-    """Compute where in the world the pixels of a depth image lie, m."""
-    height, width = camera.shape
-    x = _pixel_slopes(width, camera.view[1])[None, :] * metres
-    y = _pixel_slopes(height, camera.view[0])[:, None] * metres
-    own = jnp.stack([x, y, metres], axis=-1)
-    return position + jnp.matmul(own, rotation.T, precision=jax.lax.Precision.HIGHEST)
+) -> tuple[Float[Array, "H W"], Float[Array, "H W"], Float[Array, "H W"]]:
+    """Compute where in the world the pixels of a depth image lie: x, y and z, m."""
+    x, y = _pixel_rays(camera)
+    along, aside, up = (
+        start + metres * (row[0] * x + row[1] * y + row[2])
+        for start, row in zip(position, rotation, strict=True)
+    )
+    return along, aside, up
 
 
 def capsules_in_view(links: Links, capsules: robot.Capsules) -> Float[Array, "C 7"]:
@@ -74,20 +71,29 @@ def capsules_in_view(links: Links, capsules: robot.Capsules) -> Float[Array, "C 
     return jnp.concatenate([start, end, jnp.asarray(capsules.radius)[visible, None]], axis=1)
 
 
+def _pixel_rays(
+    camera: config.Camera,
+) -> tuple[Float[np.ndarray, "1 W"], Float[np.ndarray, "H 1"]]:
+    """Compute x and y of the ray of each pixel, d = (x, y, 1), in the camera's frame."""
+    height, width = camera.shape
+    x, y = _pixel_slopes(width, camera.view[1]), _pixel_slopes(height, camera.view[0])
+    return x[None, :], y[:, None]
+
+
 def _pixel_slopes(pixels: int, view: float) -> Float[np.ndarray, " n"]:
     """Compute the tangents of the pixels' angles from the optical axis; `view` in deg."""
     middles = 2.0 * (np.arange(pixels) + 0.5) / pixels - 1.0
     return (middles * math.tan(math.radians(0.5 * view))).astype(np.float32)
 
 
-def _render_links(
+def render_capsules(
     position: Float[Array, "3"],
     rotation: Float[Array, "3 3"],
     capsules: Float[Array, "C 7"],
-    x: Float[np.ndarray, "1 W"],
-    y: Float[np.ndarray, "H 1"],
+    camera: config.Camera,
 ) -> Float[Array, "H W"]:
-    """Render the depth of the nearest capsule along each ray d = (x, y, 1), m, or infinity."""
+    """Render the depth of the nearest capsule, m, as `render` does; infinity where none is."""
+    x, y = _pixel_rays(camera)
     # highest precision: a GPU would otherwise round the factors to 10 bits
     turn = lambda v: jnp.matmul(v, rotation, precision=jax.lax.Precision.HIGHEST)
     start = turn(capsules[:, :3] - position)  # m, in the camera's frame

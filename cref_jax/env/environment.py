@@ -236,10 +236,11 @@ def render_depth(
     if with_links and randomisation.enabled and randomisation.structures:
         capsules = jnp.concatenate([capsules, structures.sample_structures(world, state)])
     ground = _ground(world, state)
-    metres = depth.render(ground, position, rotation, capsules, camera, is_profile)
-    if with_links and randomisation.enabled and randomisation.perforations:
-        return perforations.see_through(world, state, metres, position, rotation)
-    return metres
+    if not (with_links and randomisation.enabled and randomisation.perforations):
+        return depth.render(ground, position, rotation, capsules, camera, is_profile)
+    whole = depth.render(ground, position, rotation, jnp.zeros((0, 7)), camera, is_profile)
+    pierced = perforations.see_through(world, state, whole, position, rotation)
+    return jnp.minimum(pierced, depth.render_capsules(position, rotation, capsules, camera))
 
 
 def _ground(world: World, state: EnvState) -> terrain.Terrain:

@@ -22,7 +22,7 @@ def render(world, c, states):
 def test_a_pixel_lies_where_its_ray_meets_the_ground():
     down = jnp.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]).T
     metres, above = jnp.full(C.camera.shape, 2.0), jnp.array([3.0, 1.0, 2.5])
-    points = np.asarray(depth.locate_pixels(metres, above, down, C.camera))
+    points = np.stack(depth.locate_pixels(metres, above, down, C.camera), axis=-1)
     np.testing.assert_allclose(points[..., 2], 0.5, atol=1e-6)
     np.testing.assert_allclose(points.mean((0, 1)), [3.0, 1.0, 0.5], atol=1e-5)
     reach = 2.0 * np.tan(np.radians(0.5 * np.array(C.camera.view))) * (1 - 1 / np.array([48, 64]))
@@ -50,7 +50,7 @@ def test_half_of_the_robots_see_holes_whose_depth_is_that_of_a_level_below(world
         state.camera_shift,
     )
     top, low = (
-        np.asarray(depth.locate_pixels(jnp.asarray(x[e]), *place, C.camera))[at][:, 2]
+        np.asarray(depth.locate_pixels(jnp.asarray(x[e]), *place, C.camera)[2])[at]
         for x in (before, after)
     )
     np.testing.assert_allclose(top - low, (top - low).mean(), atol=1e-4)
