@@ -72,6 +72,19 @@ def test_the_vectors_hold_a_reset_a_frame_with_holes_and_the_true_rate(small_wor
 
 
 @pytest.mark.slow
+def test_the_vectors_are_of_a_robot_with_nothing_randomised(small_world):
+    ranges = {"enabled": True, "joint_offset": 0.5, "noise_gravity": 0.5, "structures": 8}
+    c = config.override(small_world.config, {"randomisation": ranges})
+    train = trained(small_world).train
+    found, expected = (
+        reference_vectors.build_test_vectors(world, train)
+        for world in (small_world.replace(config=c), small_world)
+    )
+    for name, x in expected.items():
+        np.testing.assert_array_equal(found[name], x, err_msg=name)
+
+
+@pytest.mark.slow
 def test_a_policy_comes_back_as_it_went(directory, small_world):
     was, found = trained(small_world), reader.read(directory, small_world)
     assert found.config == was.config and found.iteration == was.iteration
