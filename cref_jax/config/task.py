@@ -111,7 +111,7 @@ class Randomisation:
     the lane"""
     perforations: float = 0.0
     """m, the widest holes that the depth image shows in the ground of half of the episodes, on
-    lanes of terrain.slit_kinds, whatever else is randomised"""
+    lanes of terrain.slit_kinds, whatever else is randomised; steps may have no risers, too"""
     depth_noise: float = 0.0
     """m, deviation of depth at 1 m, up to; grows with depth squared, as in stereo"""
     depth_scale: float = 0.0  # +-, share by which all depths are wrong
