@@ -15,7 +15,7 @@ from cref_jax.env.state import EnvState
 from cref_jax.env.world import World
 
 SHARE = 0.5  # of the episodes; assumed
-OPEN_STAIRS = 0.5  # of those, the share whose steps have no risers; assumed
+OPEN_STAIRS = 0.5  # of those with holes in treads, the share with no risers, too; assumed
 NARROWEST = 0.02  # m, of a hole; assumed
 WEBS = (0.02, 0.10)  # m, what is left between two holes; assumed
 BELOW = (0.1, 0.6)  # m from the ground to what is seen through it; assumed
@@ -44,8 +44,8 @@ def see_through(
     across = _is_in_hole(x + u[2], width, between(3, *WEBS))
     along = _is_in_hole(y + u[4], width, between(5, *WEBS))
     is_riser = _is_on_riser(x, y, z)
-    tread = jnp.stack([across, along, across & along, is_riser])[pattern]
-    is_hole = tread | (is_riser & (u[8] < OPEN_STAIRS))
+    hole = jnp.stack([across, along, across & along, is_riser])[pattern]
+    is_hole = hole | (is_riser & (u[8] < OPEN_STAIRS))
     is_seen = (u[0] < SHARE) & jnp.asarray(kinds)[state.kind]
     falls = position[2] - z  # m, from the camera to where the ray ends
     farther = metres * (1.0 + between(6, *BELOW) / jnp.maximum(falls, LEAST_FALL))
