@@ -161,7 +161,7 @@ def test_the_policys_own_vectors_raise_no_alarm(path):
         robot.step(*(vectors[name][t] for name in inputs))
         # An episode's robot leans by 7 degrees at first and rocks on its soles, which is refused
         # before the start as soon as there are samples enough.
-        rocks = Status.NOT_ON_FEET | Status.NOT_STARTED if t - begin >= 2 * TILTS - 1 else 0
+        rocks = Status.NOT_ON_FEET | Status.NOT_STARTED if t - begin >= 2 * TILTS - 1 else Status.OK
         alarms |= robot.status & ~rocks
     assert alarms & ~(Status.NO_DEPTH | Status.RATE_LIMITED | Status.RANGE_LIMITED) == Status.OK
 

@@ -48,7 +48,7 @@ class _StepState(NamedTuple):
 def build_test_vectors(world: World, train: ppo.TrainState) -> dict[str, np.ndarray]:
     """Compute the arrays of testvectors.npz: inputs, frames in metres, and `expect/` tensors.
 
-    Nothing is randomised, so that the runtime sees no fault in them.
+    Nothing is randomised: the runtime could take errors of sensors for faults.
     """
     c, period = world.config, world.config.physics.control_period
     calm = world.replace(config=config.override(c, {"randomisation": {"enabled": False}}))

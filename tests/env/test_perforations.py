@@ -37,7 +37,8 @@ def test_half_of_the_robots_see_holes_whose_depth_is_that_of_a_level_below(world
     is_hole = after > before + 1e-3
     has_holes = is_hole.any((1, 2))
     assert 0.3 < has_holes.mean() < 0.7
-    assert 0.05 < np.median(is_hole[has_holes].mean((1, 2))) < 0.6
+    share = is_hole[has_holes].mean((1, 2))
+    assert 0.05 < np.median(share) < 0.6 and share.max() < 0.9
     e = np.flatnonzero(has_holes)[0]
     at = is_hole[e] & (after[e] < D_MAX)
     state = one(states, e)
